@@ -1,8 +1,12 @@
-//! The MES with components that start, are killed and are replaced: its knowledge, and the outcome
-//! of processes.
+//! The MES with components that start, are killed and are replaced: its knowledge, which users
+//! change, and the outcome of processes.
 
 use std::fs;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::Path;
+use std::sync::mpsc;
+use std::thread;
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
@@ -144,7 +148,7 @@ fn is_replaced(run: &Value) {
 }
 
 #[test]
-fn a_manifest_cut_in_half_and_an_unknown_process_are_told_with_their_names() {
+fn a_manifest_cut_in_half_is_a_finding_and_an_unknown_process_is_refused() {
     let Some(cell) = Cell::with(&[]) else { return };
     let half = "<CAEXFile>\n<InstanceHierarchy Name=\"a\">\n<InternalElement";
     let half = cell.file("half.aml", half);
@@ -157,16 +161,31 @@ fn a_manifest_cut_in_half_and_an_unknown_process_are_told_with_their_names() {
         "manifests: [{{name: half, file: {}}}]\nprocesses:\n",
         half.display()
     );
-    let mut mes = start(
-        &cell,
-        "ua-mes",
-        "mes.yaml",
-        &[("processes:\n", &manifests)],
-        &[],
-    );
+    let changes = [("processes:\n", &*manifests)];
+    let mut mes = start(&cell, "ua-mes", "mes.yaml", &changes, &["--check"]);
     assert_eq!(mes.wait_for_end(SOON).code(), Some(78));
     let told = mes.to_string();
     assert!(told.contains("half: line 3:"), "{told}");
+    let mes = start(&cell, "ua-mes", "mes.yaml", &changes, &[]);
+    let findings = || Some(list(&get("/status")?, "findings").to_vec());
+    let found = eventually("the manifest is a finding", SOON, findings);
+    let [found] = found.as_slice() else {
+        panic!("{found:?}")
+    };
+    assert_eq!(
+        (&found["source"], &found["line"]),
+        (&"half".into(), &3.into())
+    );
+    assert_eq!(rows("processes").len(), 6, "all other sources are read");
+    // The repaired file is read again.
+    fs::copy(MANIFEST, cell.folder().join("half.aml")).unwrap();
+    mes.signal(Signal::SIGHUP);
+    eventually("the manifest is in the graph", SOON, || {
+        let modules = rows("what-can-run");
+        let is_there = modules.iter().any(|row| row["component"] == "Stage:1.0.0");
+        (is_there && findings()?.is_empty()).then_some(())
+    });
+    drop(mes);
     let mut mes = start(
         &cell,
         "ua-mes",
@@ -180,4 +199,200 @@ fn a_manifest_cut_in_half_and_an_unknown_process_are_told_with_their_names() {
             .contains("--run urn:example:process:nothing"),
         "{mes}"
     );
+}
+
+/// Runs `ua-space` with these arguments, and returns its output.
+fn space(arguments: &[&str]) -> (bool, String) {
+    let output = std::process::Command::new(program("ua-space"))
+        .args(arguments)
+        .output()
+        .unwrap();
+    let text = [output.stdout, output.stderr].concat();
+    (
+        output.status.success(),
+        String::from_utf8_lossy(&text).into_owned(),
+    )
+}
+
+/// A process as Turtle: a grasp and a release, in steps of their own.
+const HOLD: &str = r#"@prefix css: <http://www.w3id.org/hsu-aut/css#> . @prefix cask: <http://www.w3id.org/hsu-aut/cask#> .
+@prefix ua: <urn:ua-bridge:plant#> . @prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> .
+<urn:hold> a css:Process ; rdfs:label "hold" ; ua:wait 20 ; ua:hasStep <urn:hold/grip> , <urn:hold/let-go> .
+<urn:hold/grip> rdfs:label "grip" ; ua:position 1 ;
+    css:requiresCapability [ a cask:RequiredCapability , <urn:example:capability:grasp> ] FORCE .
+<urn:hold/let-go> rdfs:label "let go" ; ua:position 2 ;
+    css:requiresCapability [ a cask:RequiredCapability , <urn:example:capability:release> ] .
+"#;
+
+#[test]
+fn a_process_that_is_added_as_rdf_runs_with_one_gripper_and_outlasts_a_kill() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    fs::copy(
+        Path::new(EXAMPLES).join("capabilities.ttl"),
+        cell.folder().join("capabilities.ttl"),
+    )
+    .unwrap();
+    let store = cell.folder().join("store");
+    let store = ["--store", store.to_str().unwrap()];
+    let mes = start(&cell, "ua-mes", "mes.yaml", &[], &store);
+    // This gripper has been there for longer, and cannot grasp but release.
+    let other = [
+        ("component: parallel-gripper", "component: another"),
+        (
+            "application_uri: urn:example:gripper",
+            "application_uri: urn:example:another",
+        ),
+        ("namespace: 7", "namespace: 8"),
+        ("capability:grasp", "capability:look"),
+    ];
+    let _another = start(&cell, "ua-component", "parallel-gripper.yaml", &other, &[]);
+    let is_there = |name: &str| rows("components").iter().any(|row| row["name"] == name);
+    eventually("another gripper is in the graph", SOON, || {
+        is_there("another").then_some(())
+    });
+    let fast = [("400 ms", "50 ms")];
+    let _gripper = start(&cell, "ua-component", "parallel-gripper.yaml", &fast, &[]);
+    eventually("the gripper is in the graph", SOON, || {
+        is_there("parallel-gripper").then_some(())
+    });
+
+    let wrong = HOLD.replace(
+        "FORCE",
+        "; ua:hasParameter [ cask:hasVariableName \"Nonsense\" ; ua:value 1 ]",
+    );
+    let file = cell.file("hold.ttl", &wrong);
+    let (added, told) = space(&["source", "add", file.to_str().unwrap()]);
+    assert!(added, "{told}");
+    let plan = get("/plan/urn:hold").unwrap();
+    assert_eq!(plan["complete"], false, "{plan}");
+    let missing = plan["missing"].as_str().unwrap();
+    assert!(missing.contains("has no parameter Nonsense"), "{missing}");
+
+    let file = cell.file("hold.ttl", &HOLD.replace("FORCE", ""));
+    let (added, told) = space(&["source", "add", file.to_str().unwrap()]);
+    assert!(added && told.contains("replaced"), "{told}");
+    let plan = get("/plan/urn:hold").unwrap();
+    assert_eq!(plan["complete"], true, "{plan}");
+    let chosen: Vec<&Value> = list(&plan["plan"], "steps")
+        .iter()
+        .map(|step| &step["needs"][0]["chosen"])
+        .collect();
+    let of = |chosen: &Value| {
+        chosen
+            .as_str()
+            .unwrap_or_default()
+            .split('#')
+            .next()
+            .unwrap_or_default()
+            .to_owned()
+    };
+    assert_eq!(of(chosen[0]), "urn:example:gripper");
+    assert_eq!(
+        of(chosen[1]),
+        "urn:example:gripper",
+        "the gripper that grasped"
+    );
+
+    let update = cell.file("update.ru", "INSERT DATA { <urn:a> <urn:b> 1 }");
+    let (updated, told) = space(&["source", "update", update.to_str().unwrap()]);
+    assert!(updated, "{told}");
+    let bad = cell.file("bad.ttl", "<urn:a> <urn:b> .\n\n<urn:c> <urn:d");
+    let (added, told) = space(&["source", "add", bad.to_str().unwrap()]);
+    assert!(!added && told.contains("line 1"), "{told}");
+
+    mes.signal(Signal::SIGKILL);
+    drop(mes);
+    let run = ["--run", "urn:hold"];
+    let _mes = start(
+        &cell,
+        "ua-mes",
+        "mes.yaml",
+        &[],
+        &[&store[..], &run].concat(),
+    );
+    let done = self::run("the process of the store runs", |run| {
+        run["process"] == "urn:hold" && !run["ended_ms"].is_null()
+    });
+    assert_eq!(done["outcome"], "done", "{done}");
+    let used = list(&done["plans"][0], "ran").iter();
+    let used: Vec<&Value> = used.map(|ran| &ran["component"]).collect();
+    assert_eq!(used, ["urn:example:gripper"; 2]);
+    let (listed, told) = space(&["source", "list"]);
+    assert!(
+        listed && told.contains("hold.ttl") && told.contains("urn:ua-bridge:graph:unnamed"),
+        "{told}"
+    );
+    let (removed, told) = space(&["source", "remove", "file", "hold.ttl"]);
+    assert!(removed, "{told}");
+    assert!(get("/plan/urn:hold").is_none());
+}
+
+/// Sends an update of SPARQL. Returns whether it was acknowledged.
+fn update(text: &str) -> bool {
+    let send = || -> std::io::Result<String> {
+        let mut stream = TcpStream::connect(AT)?;
+        stream.set_read_timeout(Some(SOON))?;
+        let length = text.len();
+        write!(
+            stream,
+            "POST /update HTTP/1.1\r\nHost: {AT}\r\nContent-Type: application/sparql-update\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n{text}"
+        )?;
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer)?;
+        Ok(answer)
+    };
+    send().is_ok_and(|answer| answer.starts_with("HTTP/1.1 200"))
+}
+
+#[test]
+fn a_kill_in_the_middle_of_updates_loses_no_acknowledged_one() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    fs::copy(
+        Path::new(EXAMPLES).join("capabilities.ttl"),
+        cell.folder().join("capabilities.ttl"),
+    )
+    .unwrap();
+    let folder = cell.folder().join("store");
+    let store = ["--store", folder.to_str().unwrap()];
+    let mut acknowledged = 0;
+    for kills in 1..=3 {
+        let mes = start(&cell, "ua-mes", "mes.yaml", &[], &store);
+        eventually("the MES answers", SOON, || get("/status"));
+        let graphs = get("/graphs").unwrap();
+        let written = list(&graphs, "graphs")
+            .iter()
+            .find(|graph| graph["graph"] == "urn:updates");
+        let written = written.and_then(|graph| graph["statements"].as_u64());
+        // An update may have been stored whose acknowledgement the kill prevented.
+        let there = written.unwrap_or(0);
+        assert!(
+            there == acknowledged || there == acknowledged + 1,
+            "{there} of {acknowledged}"
+        );
+        acknowledged = there;
+        let enough = acknowledged + 100;
+        thread::scope(|scope| {
+            let (reached, wait) = mpsc::channel();
+            let updates = scope.spawn(move || {
+                let mut done = acknowledged;
+                let insert = |number| {
+                    let triple = format!("<urn:s{number}> <urn:p> {number}");
+                    update(&format!(
+                        "INSERT DATA {{ GRAPH <urn:updates> {{ {triple} }} }}"
+                    ))
+                };
+                while insert(done) {
+                    done += 1;
+                    if done == enough {
+                        reached.send(()).unwrap();
+                    }
+                }
+                done
+            });
+            wait.recv_timeout(SOON).unwrap();
+            mes.signal(Signal::SIGKILL);
+            acknowledged = updates.join().unwrap();
+        });
+        assert!(acknowledged >= 100 * kills);
+    }
 }

@@ -6,7 +6,8 @@ use std::time::SystemTime;
 
 use async_trait::async_trait;
 use knowledge::{
-    ComponentFacts, Knowledge, NodeName, ParameterFacts, SkillFacts, Source, SourceKind, TypeFacts,
+    ComponentFacts, Knowledge, Lasting, NodeName, ParameterFacts, SkillFacts, Source, SourceKind,
+    TypeFacts,
 };
 use serde::Serialize;
 use skills::{ClientOptions, FoundParameter, FoundSkill, Runs as RunsOfSkill, SkillClient, Value};
@@ -15,13 +16,18 @@ use tracing::{error, info, warn};
 
 use crate::execute::{OpenFault, Opened, Plant};
 use crate::plan::Offer;
-use crate::process::Process;
+use crate::process::{Given, Process};
+use crate::read_process::Processes;
 use crate::record::{Run, Runs};
+use crate::sources::{Finding, Sources};
+use crate::units;
 
 /// The current state of the plant.
 pub(crate) struct Cell {
     knowledge: Arc<Knowledge>,
-    pub(crate) processes: Vec<Process>,
+    sources: Arc<Sources>,
+    /// The processes of the graph, with the change of the graph after which they were read.
+    processes: Mutex<(Option<u64>, Arc<Processes>)>,
     client: ClientOptions,
     present: Mutex<Present>,
     changed: watch::Sender<u64>,
@@ -76,12 +82,13 @@ pub(crate) struct Seen {
 impl Cell {
     pub(crate) fn new(
         knowledge: Arc<Knowledge>,
-        processes: Vec<Process>,
+        sources: Arc<Sources>,
         client: ClientOptions,
     ) -> Self {
         Self {
             knowledge,
-            processes,
+            sources,
+            processes: Mutex::default(),
             client,
             present: Mutex::default(),
             changed: watch::channel(0).0,
@@ -93,9 +100,45 @@ impl Cell {
         &self.client
     }
 
+    /// Returns the processes of the graph.
+    pub(crate) fn processes(&self) -> Arc<Processes> {
+        let changes = *self.knowledge.changes().borrow();
+        let mut known = self
+            .processes
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        if known.0 != Some(changes) {
+            match Processes::read(&self.knowledge) {
+                Ok(processes) => *known = (Some(changes), Arc::new(processes)),
+                Err(fault) => error!("cannot read the processes: {fault}"),
+            }
+        }
+        Arc::clone(&known.1)
+    }
+
     /// Returns the process with an IRI.
-    pub(crate) fn process(&self, iri: &str) -> Option<&Process> {
-        self.processes.iter().find(|process| process.iri == iri)
+    ///
+    /// # Errors
+    /// The reason why it cannot run.
+    pub(crate) fn process(&self, iri: &str) -> Result<Process, String> {
+        let processes = self.processes();
+        if let Some(process) = processes.all.iter().find(|process| process.iri == iri) {
+            return Ok(process.clone());
+        }
+        let shown: String = iri.chars().take(200).collect();
+        if let Some(why) = processes.faults.get(iri) {
+            return Err(format!("`{shown}` cannot run: {why}"));
+        }
+        let known = processes.all.iter().take(MOST_SHOWN);
+        let known: Vec<_> = known.map(|process| process.iri.as_str()).collect();
+        Err(format!(
+            "`{shown}` is no process here; known are {}",
+            known.join(", ")
+        ))
+    }
+
+    pub(crate) fn sources(&self) -> &Arc<Sources> {
+        &self.sources
     }
 
     /// Adds a server to the graph after it has listed its skills.
@@ -221,19 +264,36 @@ impl Cell {
         }
     }
 
+    /// Returns the findings about sources and processes.
+    pub(crate) fn status_findings(&self) -> Vec<Finding> {
+        let mut findings = self.sources.findings();
+        let processes = self.processes();
+        findings.extend(processes.faults.iter().map(|(iri, why)| Finding {
+            kind: SourceKind::Process,
+            source: iri.clone(),
+            line: None,
+            what: why.clone(),
+            refused: true,
+        }));
+        findings
+    }
+
     /// Returns the status page as JSON.
     pub(crate) fn status(&self) -> serde_json::Value {
-        let present = self.present();
-        let components: Vec<_> = present.components.values().collect();
-        let processes = self.processes.iter().map(|process| {
+        let known = self.processes();
+        let findings = self.status_findings();
+        let processes = known.all.iter().map(|process| {
             let steps: Vec<_> = process.steps.iter().map(|step| &step.name).collect();
             serde_json::json!({ "process": process.iri, "name": process.name, "steps": steps })
         });
+        let present = self.present();
+        let components: Vec<_> = present.components.values().collect();
         serde_json::json!({
             "program": "ua-mes",
             "components": components,
             "gone": present.gone,
             "graphs": self.knowledge.sources(),
+            "findings": findings,
             "processes": processes.collect::<Vec<_>>(),
             "runs": self.runs.all(),
         })
@@ -319,40 +379,13 @@ impl Plant for Cell {
         }
     }
 
-    fn values(
-        &self,
-        skill: &str,
-        given: &[(String, serde_json::Value)],
-    ) -> Result<Vec<(String, Value)>, String> {
+    fn values(&self, skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
         let present = self.present();
         let found = present
             .components
             .values()
             .find_map(|component| component.found.get(skill));
-        let found = found.ok_or("its component is gone")?;
-        let value = |(name, value): &(String, serde_json::Value)| {
-            let known = || {
-                found
-                    .parameters
-                    .iter()
-                    .map(|parameter| parameter.name.as_str())
-                    .collect::<Vec<_>>()
-                    .join(", ")
-            };
-            let parameter = found
-                .parameters
-                .iter()
-                .find(|parameter| parameter.name == *name);
-            let parameter = parameter.ok_or_else(|| {
-                format!("{} has no parameter {name}; it has {}", found.name, known())
-            })?;
-            let value = parameter
-                .shape
-                .read_json(value)
-                .map_err(|why| format!("{name}: {why}"))?;
-            Ok((name.clone(), value))
-        };
-        given.iter().map(value).collect()
+        values(found.ok_or("its component is gone")?, given)
     }
 
     fn keep(&self, run: &Run) {
@@ -364,10 +397,10 @@ impl Plant for Cell {
                 );
             }
         }
-        if let Err(fault) = self.knowledge.replace(
+        if let Err(fault) = self.knowledge.replace_with(
             &Source::new(SourceKind::Run, &run.run),
             &run.triples(),
-            run.started_ms,
+            (run.started_ms, Lasting::Yes),
         ) {
             error!(run = run.run, "a run is not taken into the graph: {fault}");
         }
@@ -375,6 +408,85 @@ impl Plant for Cell {
 
     fn now(&self) -> u64 {
         now()
+    }
+}
+
+/// Converts the parameters of a step to the parameters of a skill.
+///
+/// # Errors
+/// The first parameter that is unknown, missing, of another type or unit, or out of its limits.
+fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
+    for known in &found.parameters {
+        let is_given = given.iter().any(|given| given.name == known.name);
+        if known.default.is_none() && !is_given {
+            return Err(format!(
+                "{} needs the parameter {}, and the step does not give it",
+                found.name, known.name
+            ));
+        }
+    }
+    let value = |given: &Given| {
+        let parameter = found
+            .parameters
+            .iter()
+            .find(|parameter| parameter.name == given.name);
+        let parameter = parameter.ok_or_else(|| {
+            let known: Vec<_> = found
+                .parameters
+                .iter()
+                .map(|parameter| parameter.name.as_str())
+                .collect();
+            let known = if known.is_empty() {
+                "it has none".to_owned()
+            } else {
+                format!("it has {}", known.join(", "))
+            };
+            format!("{} has no parameter {}; {known}", found.name, given.name)
+        })?;
+        let wrong = |why: String| format!("{}: {why}", given.name);
+        let json = in_unit(given, parameter).map_err(wrong)?;
+        let value = parameter.shape.read_json(&json).map_err(wrong)?;
+        let numbers = match &value {
+            Value::Array(_, elements) => elements.iter().filter_map(Value::as_f64).collect(),
+            one => Vec::from_iter(one.as_f64()),
+        };
+        if let Some((low, high)) = parameter.range
+            && let Some(number) = numbers
+                .into_iter()
+                .find(|number| !(low..=high).contains(number))
+        {
+            let unit = parameter.unit.as_deref().unwrap_or_default();
+            let why = format!("{number} is not from {low} to {high} {unit}");
+            return Err(wrong(why.trim_end().to_owned()));
+        }
+        Ok((given.name.clone(), value))
+    };
+    given.iter().map(value).collect()
+}
+
+/// Returns the value of a parameter in the unit of the skill.
+fn in_unit(given: &Given, parameter: &FoundParameter) -> Result<serde_json::Value, String> {
+    let Some(from) = given.unit.as_deref() else {
+        return Ok(given.value.clone());
+    };
+    let Some(to) = parameter.unit.as_deref() else {
+        return Err(format!("the skill gives no unit, and {from} is given"));
+    };
+    if from == to {
+        return Ok(given.value.clone());
+    }
+    let one = |value: &serde_json::Value| {
+        let number = value.as_f64();
+        let number =
+            number.ok_or_else(|| format!("`{value}` with the unit {from} is no number"))?;
+        let converted = units::convert(number, from, to);
+        converted
+            .map(Into::into)
+            .ok_or_else(|| format!("its unit is {to}, and {from} cannot be converted to it"))
+    };
+    match &given.value {
+        serde_json::Value::Array(all) => all.iter().map(one).collect(),
+        value => one(value),
     }
 }
 
@@ -435,6 +547,8 @@ fn parameter_facts(parameter: &FoundParameter, is_output: bool) -> ParameterFact
             .as_ref()
             .filter(|_| !is_output)
             .map(|value| value.to_json().to_string()),
+        min: parameter.range.map(|range| range.0),
+        max: parameter.range.map(|range| range.1),
         unit: parameter.unit.clone(),
         node: NodeName::parse(&parameter.node),
         ..ParameterFacts::default()
@@ -459,3 +573,5 @@ pub(crate) fn since_1970(at: SystemTime) -> u64 {
 }
 
 const MOST_GONE: usize = 100;
+/// Number of processes that an error names.
+const MOST_SHOWN: usize = 50;

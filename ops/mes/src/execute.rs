@@ -14,7 +14,7 @@ use tokio::sync::watch;
 use tracing::{info, warn};
 
 use crate::plan::{Fallen, Offer, Plan, plan};
-use crate::process::{Job, Process, Role};
+use crate::process::{Given, Job, Process, Role};
 use crate::record::{How, Planned, Ran, Run};
 
 /// The plant as the execution of a process needs it.
@@ -31,11 +31,7 @@ pub(crate) trait Plant: Send + Sync {
     async fn open(&self, offers: &[Offer]) -> Result<Box<dyn Opened>, OpenFault>;
 
     /// Converts the parameters of a step to the parameters of a skill.
-    fn values(
-        &self,
-        skill: &str,
-        given: &[(String, serde_json::Value)],
-    ) -> Result<Vec<(String, Value)>, String>;
+    fn values(&self, skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String>;
 
     /// Stores the state of a run.
     fn keep(&self, run: &Run);
@@ -133,7 +129,13 @@ fn tell(run: &Run) {
 
 /// Plans a process without running it.
 pub(crate) fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
-    plan(process, &plant.offers(), &[])
+    plan_now(plant, process, &plant.offers(), &[])
+}
+
+fn plan_now(plant: &dyn Plant, process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Plan {
+    plan(process, offers, fallen, &|offer, step| {
+        plant.values(&offer.skill, &step.parameters).map(drop)
+    })
 }
 
 struct Execution<'a> {
@@ -200,7 +202,7 @@ impl Execution<'_> {
         loop {
             changes.mark_unchanged();
             let offers = self.plant.offers();
-            let plan = plan(self.process, &offers, &self.log.fallen());
+            let plan = plan_now(self.plant, self.process, &offers, &self.log.fallen());
             if plan.is_complete() {
                 let mut chosen: Vec<(Role, Offer)> = Vec::new();
                 for role in self
@@ -280,7 +282,7 @@ impl Execution<'_> {
             chosen.iter().map(|(role, _)| *role).zip(watched).collect();
         let ended = match &self.process.work {
             Job::PickAndPlace(job) => self.pick_and_place(job, &roles).await,
-            Job::Sequence(parameters) => self.sequence(parameters, chosen, &roles).await,
+            Job::Sequence => self.sequence(chosen, &roles).await,
         };
         drop(roles);
         // A lost component does not respond to the close.
@@ -334,20 +336,11 @@ impl Execution<'_> {
         }
     }
 
-    async fn sequence(
-        &self,
-        parameters: &[Vec<(String, serde_json::Value)>],
-        chosen: &[(Role, Offer)],
-        roles: &[(Role, Arc<dyn Runs>)],
-    ) -> Ended {
-        for (((_, skill), (_, offer)), (step, given)) in roles
-            .iter()
-            .zip(chosen)
-            .zip(self.process.steps.iter().zip(parameters))
-        {
+    async fn sequence(&self, chosen: &[(Role, Offer)], roles: &[(Role, Arc<dyn Runs>)]) -> Ended {
+        for (((_, skill), (_, offer)), step) in roles.iter().zip(chosen).zip(&self.process.steps) {
             self.log.step(&step.name);
             self.teller.step("Step").await;
-            let values = match self.plant.values(&offer.skill, given) {
+            let values = match self.plant.values(&offer.skill, &step.parameters) {
                 Ok(values) => values,
                 Err(why) => return Ended::Over(format!("{}: {why}", step.name)),
             };
@@ -587,7 +580,7 @@ fn of_step(process: &Process, step: &str) -> String {
             }
         }
         (Job::PickAndPlace(_), [all]) => Some(all),
-        (Job::PickAndPlace(_), []) | (Job::Sequence(_), _) => None,
+        (Job::PickAndPlace(_), []) | (Job::Sequence, _) => None,
     };
     of.map_or_else(|| step.to_owned(), |of| of.name.clone())
 }

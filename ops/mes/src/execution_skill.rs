@@ -26,17 +26,8 @@ impl Driver for ExecuteProcess {
 
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
         let iri = parameters.text("ProcessIri").unwrap_or_default();
-        if self.cell.process(iri).is_none() {
-            let known: Vec<_> = self
-                .cell
-                .processes
-                .iter()
-                .map(|process| process.iri.as_str())
-                .collect();
-            return Err(format!(
-                "ProcessIri: `{iri}` is no process here; known are {}",
-                known.join(", ")
-            ));
+        if let Err(why) = self.cell.process(iri) {
+            return Err(format!("ProcessIri: {why}"));
         }
         match parameters.text("ExecutionMode") {
             Some("execute" | "plan") | None => Ok(()),
@@ -52,7 +43,7 @@ impl Driver for ExecuteProcess {
             .text("ProcessIri")
             .unwrap_or_default()
             .to_owned();
-        let process = self.cell.process(&iri).ok_or("there is no such process")?;
+        let process = self.cell.process(&iri)?;
         let report = |report: &serde_json::Value| {
             Ok(vec![(
                 "Report".to_owned(),
@@ -60,7 +51,7 @@ impl Driver for ExecuteProcess {
             )])
         };
         if work.parameters().text("ExecutionMode") == Some("plan") {
-            let plan = dry_run(&*self.cell, process);
+            let plan = dry_run(&*self.cell, &process);
             let (complete, missing) = (plan.is_complete(), plan.missing());
             let whole = serde_json::json!({ "process": iri, "complete": complete, "missing": missing, "plan": plan });
             if whole.to_string().len() <= MOST_REPORT {
@@ -74,7 +65,7 @@ impl Driver for ExecuteProcess {
         }
         let plant: Arc<dyn Plant> = Arc::clone(&self.cell) as Arc<dyn Plant>;
         let number = self.runs.fetch_add(1, Ordering::Relaxed);
-        let run = execute(&plant, process, number, &Telling(&work)).await;
+        let run = execute(&plant, &process, number, &Telling(&work)).await;
         match (run.outcome, run.reason) {
             (How::Done, _) => report(
                 &serde_json::json!({ "run": run.run, "process": iri, "plans": run.plans.len(), "outcome": "done" }),

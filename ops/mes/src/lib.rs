@@ -4,25 +4,27 @@
 //! Reading order:
 //!
 //! - `settings`: the YAML
-//! - `process`: processes and their steps
+//! - `process`, `read_process`: processes and their steps, and how the graph has them
 //! - `plan`: the assignment of skills to steps, with reasons
 //! - `execute`: the execution of a plan, and planning again after a loss
 //! - `record`: the record of runs
 //! - `cell`: the current state of the plant
 //! - `follow`: from discovery to the graph
-//! - `import`: from files to the graph
+//! - `sources`: from files to the graph, while the program runs
 //! - `execution_skill` and `locate_skill`: the skills of the MES
 
 mod cell;
 mod execute;
 mod execution_skill;
 mod follow;
-mod import;
 mod locate_skill;
 mod plan;
 mod process;
+mod read_process;
 mod record;
 mod settings;
+mod sources;
+mod units;
 
 use std::ffi::OsString;
 use std::net::SocketAddr;
@@ -35,21 +37,24 @@ use std::time::Duration;
 use bridge_node::{
     Arguments, Context, Failure, FailureKind, KeyService, Made, Owned, Program, WithoutMapping,
 };
-use knowledge::{Endpoint, Knowledge, Limits};
+use knowledge::{Endpoint, Knowledge, Limits, May, SourceFiles, Writes};
 use mappings::{Mapping, SpaceId};
 use plant_opcua::enrolment::GdsArguments;
+use plant_opcua::users::{self, Access, Role};
 use skills::yaml::Place;
 use skills::{
     ClientOptions, Component, Driver, DriverSetup, Lds, LocalRun, Owner, Runs as _, Security,
     Skill, SkillSetup, TypeName, Value,
 };
-use tracing::{error, info};
+use tokio::signal::unix::{SignalKind, signal};
+use tracing::{error, info, warn};
 use ua_component::{ComponentPort, Options, made};
 
 use crate::cell::Cell;
 use crate::execution_skill::ExecuteProcess;
 use crate::locate_skill::LocateObject;
 use crate::settings::Settings;
+use crate::sources::Sources;
 
 /// The semantic MES: knows the components of the plant, answers questions about them, and runs processes with them.
 #[derive(Debug, clap::Parser)]
@@ -67,6 +72,10 @@ struct UaMes {
     /// Where questions are answered, in place of what the YAML says; loopback only
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_SPARQL")]
     sparql: Option<SocketAddr>,
+    /// The folder in which added sources and records of runs are stored, in place of what the YAML
+    /// says
+    #[arg(long, value_name = "DIR", env = "UA_STORE")]
+    store: Option<PathBuf>,
     /// Where clients connect, as opc.tcp://127.0.0.1:0, in place of what the YAML says
     #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
     endpoint: Option<String>,
@@ -129,10 +138,9 @@ impl UaMes {
             return Ok(ready);
         }
         let settings = self.settings()?;
-        let knowledge =
-            Knowledge::new().map_err(|fault| Failure::new(FailureKind::Io, fault.to_string()))?;
-        import::all(&knowledge, &settings, cell::now())?;
-        let knowledge = Arc::new(knowledge);
+        let knowledge = Arc::new(self.knowledge(&settings)?);
+        let sources = Arc::new(Sources::new(Arc::clone(&knowledge)));
+        sources.read(&settings);
         let options = self.options(&settings);
         let client = ClientOptions {
             // The ApplicationUri of the certificate: servers refuse a session with another one.
@@ -143,16 +151,8 @@ impl UaMes {
             within: WITHIN,
             ..ClientOptions::default()
         };
-        let cell = Arc::new(Cell::new(
-            Arc::clone(&knowledge),
-            settings.processes.clone(),
-            client,
-        ));
-        if let Some(iri) = self
-            .run
-            .as_deref()
-            .filter(|iri| cell.process(iri).is_none())
-        {
+        let cell = Arc::new(Cell::new(Arc::clone(&knowledge), sources, client));
+        if let Some(iri) = self.run.as_deref().filter(|iri| cell.process(iri).is_err()) {
             return Err(Failure::new(
                 FailureKind::Usage,
                 format!("--run {iri}: {} has no such process", self.mes.display()),
@@ -173,6 +173,96 @@ impl UaMes {
             knowledge,
             options,
         }))
+    }
+
+    /// Opens the knowledge, with its lasting sources if it has a folder.
+    fn knowledge(&self, settings: &Settings) -> Result<Knowledge, Failure> {
+        let folder = self.store.as_ref().or(settings.store.as_ref());
+        let Some(folder) = folder.filter(|_| !self.check) else {
+            let made = Knowledge::new();
+            return made.map_err(|fault| Failure::new(FailureKind::Io, fault.to_string()));
+        };
+        let shown = folder.display();
+        let (knowledge, damaged) = Knowledge::open(folder).map_err(|fault| {
+            Failure::new(
+                FailureKind::Io,
+                format!("cannot open the store {shown}: {fault}"),
+            )
+        })?;
+        if damaged > 0 {
+            warn!(
+                "{damaged} bytes at the end of the journal in {shown} are incomplete; they are in knowledge.journal.damaged"
+            );
+        }
+        let sources = knowledge.sources().len();
+        info!(sources, "the store {shown} is read");
+        Ok(knowledge)
+    }
+
+    /// Returns the handlers of changes over HTTP.
+    fn writes(&self, ready: &Ready) -> Result<Writes, Failure> {
+        let settings = &ready.settings;
+        let folder = self.pki_root(settings).join(users::FOLDER);
+        let access = Access::new(Some(folder), settings.sparql.ip().is_loopback());
+        let access = access.map_err(|fault| {
+            Failure::new(
+                FailureKind::Configuration,
+                format!("cannot read the users: {fault}"),
+            )
+        })?;
+        let access = Arc::new(access);
+        let may: May = Arc::new(move |user| {
+            let access = Arc::clone(&access);
+            Box::pin(async move {
+                access.look();
+                match user {
+                    Some((name, password)) => {
+                        let roles = access.roles_by_password(&name, &password, "SPARQL").await;
+                        roles.contains(Role::Engineer)
+                    }
+                    // Without any user, programs of this host may write.
+                    None => access.roles_of_anonymous().contains(Role::Operator),
+                }
+            })
+        });
+        Ok(Writes {
+            now: cell::now,
+            may,
+            files: Arc::clone(ready.cell.sources()) as Arc<dyn SourceFiles>,
+        })
+    }
+
+    /// Reads the YAML and its files again at each SIGHUP.
+    fn reload(&self, ready: &Ready) -> Result<impl Future<Output = ()> + use<>, Failure> {
+        let mut hangups = signal(SignalKind::hangup()).map_err(|error| {
+            Failure::new(
+                FailureKind::Io,
+                format!("cannot listen for SIGHUP: {error}"),
+            )
+        })?;
+        let sources = Arc::clone(ready.cell.sources());
+        let (file, name) = (self.mes.clone(), self.mes.display().to_string());
+        Ok(async move {
+            while hangups.recv().await.is_some() {
+                let (file, name) = (file.clone(), name.clone());
+                let sources = Arc::clone(&sources);
+                let read = tokio::task::spawn_blocking(move || match read_settings(&file) {
+                    Ok(settings) => {
+                        sources.read(&settings);
+                        sources.yaml(&name, None);
+                        let findings = sources.findings().len();
+                        info!(findings, "SIGHUP: the sources of {name} were read again");
+                    }
+                    Err(why) => {
+                        warn!("SIGHUP: the sources stay as they are: {why}");
+                        sources.yaml(&name, Some(why));
+                    }
+                });
+                if let Err(error) = read.await {
+                    error!("SIGHUP: the sources were not read: {error}");
+                }
+            }
+        })
     }
 
     fn settings(&self) -> Result<Settings, Failure> {
@@ -234,11 +324,12 @@ impl UaMes {
     async fn serve(&self, ready: &Ready) -> Result<(), Failure> {
         let page = page(&ready.cell);
         let address = ready.settings.sparql;
-        let endpoint = Endpoint::bind(
+        let endpoint = Endpoint::bind_with(
             address,
             Arc::clone(&ready.knowledge),
             Limits::default(),
             page,
+            Some(self.writes(ready)?),
         )
         .await;
         let endpoint = endpoint.map_err(|error| {
@@ -254,6 +345,7 @@ impl UaMes {
             endpoint.address()
         );
         drop(self.serving.set(endpoint));
+        drop(tokio::spawn(self.reload(ready)?));
         let interface = self.interface();
         let only_loopback = self.arguments.0.flags.interface.is_none()
             || interface == discovery::Interface::LOOPBACK;
@@ -292,6 +384,15 @@ impl Program for UaMes {
         let ready = self.ready()?;
         if self.check {
             ua_component::check(&ready.component, &ready.options)?;
+            let mut refused = ready.cell.status_findings();
+            refused.retain(|finding| finding.refused);
+            if let Some(first) = refused.first() {
+                let (count, source, what) = (refused.len(), &first.source, &first.what);
+                return Err(Failure::new(
+                    FailureKind::Configuration,
+                    format!("{count} sources cannot be read; the first: {source}: {what}"),
+                ));
+            }
             return Ok(Some(Made::Checked));
         }
         Ok(Some(Made::Run(made(&ready.component))))
@@ -367,6 +468,17 @@ fn component(settings: &Settings, driver: ExecuteProcess, locator: LocateObject)
     }
 }
 
+/// Reads the YAML again.
+///
+/// # Errors
+/// All findings with their lines.
+fn read_settings(file: &Path) -> Result<Settings, String> {
+    let name = file.display().to_string();
+    let text = bridge_node::read_text_file(file).map_err(|error| error.to_string())?;
+    let folder = file.parent().unwrap_or_else(|| Path::new(""));
+    Settings::from_yaml(&text, folder).map_err(|findings| findings.render(&name, &text))
+}
+
 /// Returns the pages `/status` and `/plan/IRI`. The latter shows the plan that would be run, with
 /// its reasons.
 fn page(cell: &Arc<Cell>) -> knowledge::Page {
@@ -376,8 +488,9 @@ fn page(cell: &Arc<Cell>) -> knowledge::Page {
             return Some(cell.status().to_string());
         }
         let iri = path.strip_prefix("/plan/")?;
-        let process = cell
-            .processes
+        let processes = cell.processes();
+        let process = processes
+            .all
             .iter()
             .find(|process| process.iri == iri || mtp::escaped(&process.iri) == iri)?;
         let plan = execute::dry_run(&*cell, process);

@@ -25,15 +25,40 @@ pub(crate) struct Process {
 pub(crate) enum Job {
     /// All steps together, by the composite that moves an object to another pose.
     PickAndPlace(skills::Job),
-    /// A sequence of skills, with these parameters as JSON.
-    Sequence(Vec<Vec<(String, serde_json::Value)>>),
+    /// A sequence of skills: each step is a skill.
+    Sequence,
 }
 
 /// A step.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(crate) struct Step {
     pub(crate) name: String,
     pub(crate) needs: Vec<Need>,
+    /// The parameters of its skill, in a sequence.
+    pub(crate) parameters: Vec<Given>,
+    pub(crate) by: By,
+}
+
+/// A parameter as the process gives it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Given {
+    pub(crate) name: String,
+    pub(crate) value: serde_json::Value,
+    /// The unit of the value; that of the skill if missing.
+    pub(crate) unit: Option<String>,
+}
+
+/// The component that has to do a step of a sequence.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) enum By {
+    /// Any component that can. A release is done by the component that grasped, and a tool that an
+    /// earlier step attaches does the steps that it can do.
+    #[default]
+    Any,
+    /// The component of the step with this number.
+    SameAs(usize),
+    /// The tool that an earlier step attaches.
+    AttachedTool,
 }
 
 /// A skill that a step needs.
@@ -123,15 +148,45 @@ impl Process {
         let iri = |iri: &str| Object::Iri(iri.to_owned());
         say(&self.iri, v::RDF_TYPE, iri(v::PROCESS));
         say(&self.iri, v::RDFS_LABEL, Object::Text(self.name.clone()));
-        for (step, position) in self.steps.iter().zip(1_i64..) {
-            let step_iri = step_iri(&self.iri, &step.name);
-            say(&self.iri, v::HAS_STEP, iri(&step_iri));
-            say(&step_iri, v::RDF_TYPE, iri(v::STEP));
-            say(&step_iri, v::RDFS_LABEL, Object::Text(step.name.clone()));
-            say(&step_iri, v::POSITION, Object::Integer(position));
+        for (time, predicate) in [(self.within, v::WITHIN), (self.wait, v::WAIT)] {
+            say(&self.iri, predicate, Object::Number(time.as_secs_f64()));
+        }
+        if let Job::PickAndPlace(job) = &self.work {
+            for (position, predicate) in [(job.pick, v::PICK), (job.place, v::PLACE)] {
+                let numbers: Vec<_> = position.iter().map(ToString::to_string).collect();
+                say(&self.iri, predicate, Object::Text(numbers.join(" ")));
+            }
+            say(&self.iri, v::APPROACH, Object::Number(job.approach));
+        }
+        let iris = self.step_iris();
+        for ((step, position), step_iri) in self.steps.iter().zip(1_i64..).zip(&iris) {
+            for (given, number) in step.parameters.iter().zip(1..) {
+                let parameter = format!("{step_iri}/parameter/{number}");
+                say(step_iri, v::HAS_PARAMETER, iri(&parameter));
+                let name = Object::Text(given.name.clone());
+                say(&parameter, v::HAS_VARIABLE_NAME, name);
+                let (predicate, value) = literal(&given.value);
+                say(&parameter, predicate, value);
+                if let Some(unit) = &given.unit {
+                    say(&parameter, v::UNIT, Object::Text(unit.clone()));
+                }
+            }
+            match step.by {
+                By::Any => {}
+                By::SameAs(number) => {
+                    if let Some(other) = iris.get(number) {
+                        say(step_iri, v::BY_COMPONENT_OF, iri(other));
+                    }
+                }
+                By::AttachedTool => say(step_iri, v::BY_ATTACHED_TOOL, Object::Boolean(true)),
+            }
+            say(&self.iri, v::HAS_STEP, iri(step_iri));
+            say(step_iri, v::RDF_TYPE, iri(v::STEP));
+            say(step_iri, v::RDFS_LABEL, Object::Text(step.name.clone()));
+            say(step_iri, v::POSITION, Object::Integer(position));
             for need in &step.needs {
                 let need_iri = format!("{step_iri}/{}", need.role.name());
-                say(&step_iri, v::REQUIRES_CAPABILITY, iri(&need_iri));
+                say(step_iri, v::REQUIRES_CAPABILITY, iri(&need_iri));
                 say(&need_iri, v::RDF_TYPE, iri(v::REQUIRED_CAPABILITY));
                 say(
                     &need_iri,
@@ -142,12 +197,55 @@ impl Process {
                     say(&need_iri, v::RDF_TYPE, iri(class));
                     say(class, v::RDFS_SUB_CLASS_OF, iri(v::CAPABILITY));
                 }
-                if let Some(type_iri) = need.skill_type.as_ref().and_then(type_iri) {
+                if let Some(of) = &need.skill_type {
+                    let known = type_iri(of);
+                    // A type that no source describes stays a requirement.
+                    let unknown = || format!("urn:ua-bridge:type:{}", escaped(&of.to_string()));
+                    let type_iri = known.clone().unwrap_or_else(unknown);
                     say(&need_iri, v::REQUIRES_TYPE, iri(&type_iri));
+                    if known.is_none() {
+                        say(&type_iri, v::BROWSE_NAME, Object::Text(of.name.clone()));
+                        let namespace = Object::Text(of.namespace.clone());
+                        say(&type_iri, v::NODE_NAMESPACE, namespace);
+                    }
                 }
             }
         }
         all
+    }
+
+    /// Returns the IRIs of the steps. Steps of one name have their positions in the IRIs.
+    fn step_iris(&self) -> Vec<String> {
+        let mut iris: Vec<String> = Vec::new();
+        for (step, position) in self.steps.iter().zip(1..) {
+            let plain = step_iri(&self.iri, &step.name);
+            let is_new = !iris.contains(&plain);
+            iris.push(if is_new {
+                plain
+            } else {
+                format!("{plain}/{position}")
+            });
+        }
+        iris
+    }
+}
+
+/// Returns the predicate and the literal of a value: structured values are texts of JSON.
+fn literal(value: &serde_json::Value) -> (&'static str, Object) {
+    use serde_json::Value;
+    let object = match value {
+        Value::Bool(value) => Some(Object::Boolean(*value)),
+        Value::String(text) => Some(Object::Text(text.clone())),
+        Value::Number(number) => match number.as_i64() {
+            Some(number) => Some(Object::Integer(number)),
+            None if number.is_f64() => number.as_f64().map(Object::Number),
+            None => None,
+        },
+        Value::Null | Value::Array(_) | Value::Object(_) => None,
+    };
+    match object {
+        Some(object) => (v::VALUE, object),
+        None => (v::VALUE_JSON, Object::Text(value.to_string())),
     }
 }
 

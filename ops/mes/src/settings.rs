@@ -10,7 +10,7 @@ use plant_opcua::client::ClientUser;
 use skills::yaml::{Code, Findings, Kind, Node, Reader, parse};
 use skills::{Lds, Security, TypeName};
 
-use crate::process::{Job, Need, Process, Role, Step};
+use crate::process::{By, Given, Job, Need, Process, Role, Step};
 
 /// The settings of the MES.
 #[derive(Debug, Clone)]
@@ -28,6 +28,8 @@ pub(crate) struct Settings {
     pub(crate) user: Option<ClientUser>,
     /// The address of the SPARQL endpoint.
     pub(crate) sparql: SocketAddr,
+    /// The folder of the lasting sources.
+    pub(crate) store: Option<PathBuf>,
     /// Turtle files.
     pub(crate) knowledge: Vec<Source>,
     pub(crate) nodesets: Vec<Source>,
@@ -92,6 +94,7 @@ impl Reading<'_> {
             "open",
             "user",
             "sparql",
+            "store",
             "knowledge",
             "nodesets",
             "manifests",
@@ -107,6 +110,7 @@ impl Reading<'_> {
             open,
             user,
             sparql,
+            store,
             knowledge,
             nodesets,
             manifests,
@@ -139,6 +143,10 @@ impl Reading<'_> {
             None => None,
         };
         let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node));
+        let store = match store {
+            Some(node) => Some(self.reader.text(node, "the path of a folder")?),
+            None => None,
+        };
         let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
         let nodesets = nodesets.map_or_else(Vec::new, |node| self.files(node));
         let manifests = manifests
@@ -161,6 +169,7 @@ impl Reading<'_> {
             open: open?,
             user,
             sparql: sparql?,
+            store: store.map(|path| self.folder.join(path)),
             knowledge,
             nodesets,
             manifests,
@@ -289,13 +298,12 @@ impl Reading<'_> {
             );
         }
         let is_composite = composite.is_some();
-        let read: Vec<_> = nodes
-            .iter()
-            .take(MOST_STEPS)
-            .enumerate()
-            .filter_map(|(number, node)| self.step(node, is_composite.then_some(()).ok_or(number)))
-            .collect();
-        let (steps, parameters): (Vec<Step>, Vec<_>) = read.into_iter().unzip();
+        let mut steps: Vec<Step> = Vec::new();
+        for (number, node) in nodes.iter().take(MOST_STEPS).enumerate() {
+            let kind = is_composite.then_some(()).ok_or(number);
+            let step = self.step(node, kind, &steps);
+            steps.extend(step);
+        }
         let work = match composite {
             Some(composite) => {
                 let roles: Vec<Role> = steps
@@ -315,7 +323,7 @@ impl Reading<'_> {
                 }
                 self.job(composite).map(Job::PickAndPlace)
             }
-            None => Some(Job::Sequence(parameters)),
+            None => Some(Job::Sequence),
         };
         Some(Process {
             iri: iri?,
@@ -367,12 +375,9 @@ impl Reading<'_> {
     }
 
     /// Reads a step of a composite, or the step with a number that a single skill does.
-    fn step(
-        &mut self,
-        node: &Node,
-        kind: Result<(), usize>,
-    ) -> Option<(Step, Vec<(String, serde_json::Value)>)> {
-        let [name, needs, parameters] = self.reader.map(node, ["step", "needs", "parameters"])?;
+    fn step(&mut self, node: &Node, kind: Result<(), usize>, earlier: &[Step]) -> Option<Step> {
+        let keys = ["step", "needs", "parameters", "by"];
+        let [name, needs, parameters, by] = self.reader.map(node, keys)?;
         let name = self
             .reader
             .needed(name, "step", node.place)
@@ -422,17 +427,72 @@ impl Reading<'_> {
             };
             for (key, value) in pairs {
                 if let Some(name) = self.reader.text(key, "the name of a parameter") {
-                    given.push((name.to_owned(), json(value)));
+                    given.extend(self.given(name, value));
                 }
             }
         }
-        Some((
-            Step {
-                name: name?.to_owned(),
-                needs: read,
-            },
-            given,
-        ))
+        let by = match by {
+            Some(by) if kind.is_ok() => {
+                let why =
+                    "`pick_and_place` chooses one component for the tool and one for the robot";
+                return self.reader.refuse(by, Code::UnknownKey, why.to_owned());
+            }
+            Some(by) => self.by(by, earlier)?,
+            None => By::Any,
+        };
+        Some(Step {
+            name: name?.to_owned(),
+            needs: read,
+            parameters: given,
+            by,
+        })
+    }
+
+    /// Reads a parameter: its value, or a map of `value` and `unit`.
+    fn given(&mut self, name: &str, node: &Node) -> Option<Given> {
+        let (value, unit) = match &node.kind {
+            Kind::Map(_) => {
+                let [value, unit] = self.reader.map(node, ["value", "unit"])?;
+                let value = self.reader.needed(value, "value", node.place)?;
+                let unit = match unit {
+                    Some(unit) => Some(self.reader.text(unit, "a unit")?.to_owned()),
+                    None => None,
+                };
+                (value, unit)
+            }
+            Kind::Scalar(_) | Kind::List(_) | Kind::Null => (node, None),
+        };
+        Some(Given {
+            name: name.to_owned(),
+            value: json(value),
+            unit,
+        })
+    }
+
+    /// Reads the component that has to do a step.
+    fn by(&mut self, node: &Node, earlier: &[Step]) -> Option<By> {
+        if matches!(&node.kind, Kind::Scalar(text) if text == "attached-tool") {
+            return Some(By::AttachedTool);
+        }
+        let expected = "expected `attached-tool`, or the component of an earlier step, as {component_of: STEP}";
+        if !matches!(node.kind, Kind::Map(_)) {
+            return self
+                .reader
+                .refuse(node, Code::WrongValue, expected.to_owned());
+        }
+        let [of] = self.reader.map(node, ["component_of"])?;
+        let of = self.reader.needed(of, "component_of", node.place)?;
+        let name = self.reader.text(of, "the name of a step")?;
+        let number = earlier.iter().position(|step| step.name == name);
+        number.map(By::SameAs).or_else(|| {
+            let known: Vec<_> = earlier.iter().map(|step| step.name.as_str()).collect();
+            let why = format!(
+                "no earlier step is called `{}`; there are {}",
+                shortened(name),
+                known.join(", ")
+            );
+            self.reader.refuse(of, Code::WrongValue, why)
+        })
     }
 
     fn need(&mut self, node: &Node, role: Role) -> Option<Need> {
@@ -600,73 +660,4 @@ const USUALLY_APPROACH: f64 = 0.05;
 const MOST_STEPS: usize = 100;
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const EXAMPLE: &str = include_str!("../../../examples/plant/mes.yaml");
-
-    #[test]
-    fn the_example_is_read_as_it_stands() {
-        let settings = Settings::from_yaml(EXAMPLE, Path::new("examples/plant"))
-            .unwrap_or_else(|findings| panic!("{}", findings.render("mes.yaml", EXAMPLE)));
-        let [process] = settings.processes.as_slice() else {
-            panic!("{settings:?}")
-        };
-        assert_eq!(process.iri, "urn:example:process:move-part");
-        let steps: Vec<_> = process
-            .steps
-            .iter()
-            .map(|step| step.name.as_str())
-            .collect();
-        assert_eq!(steps, ["pick", "place"]);
-        let grasp = process.steps[0]
-            .needs
-            .iter()
-            .find(|need| need.role == Role::Grasp)
-            .unwrap();
-        assert_eq!(
-            grasp.capability.as_deref(),
-            Some("urn:example:capability:grasp")
-        );
-        assert_eq!(grasp.skill_type, Some(TypeName::own("GraspSkillType")));
-        assert_eq!(
-            settings.knowledge[0].path,
-            Path::new("examples/plant/capabilities.ttl")
-        );
-    }
-
-    #[test]
-    fn all_that_is_wrong_is_told_at_once_with_its_line() {
-        let text = "mes: a b\napplication_uri: urn:x\nnamespace: 0\nsparql: 0.0.0.0:80\nmanifests:\n  - {name: m}\nprocesses:\n  - process: not an iri\n    pick_and_place: {pick: [1, 2], place: [0, 0, 0, 0, 0, 0]}\n    steps:\n      - step: pick\n        needs: {grip: urn:x}\n";
-        let told = Settings::from_yaml(text, Path::new(""))
-            .unwrap_err()
-            .render("mes.yaml", text);
-        for wanted in [
-            "mes.yaml:1:6",
-            "mes.yaml:3:12",
-            "address of loopback",
-            "`file` is missing",
-            "`not an iri` is no IRI",
-            "six numbers",
-            "`grip` is not known here; known are ptp, linear, grasp, release",
-            "no step says who is to be `grasp`",
-        ] {
-            assert!(told.contains(wanted), "{wanted}:\n{told}");
-        }
-    }
-
-    #[test]
-    fn steps_that_are_done_by_themselves_have_parameters() {
-        let text = "mes: m\napplication_uri: urn:x\nnamespace: 5\nprocesses:\n  - process: urn:p\n    steps:\n      - {step: grip, needs: {skill: {type: GraspSkillType}}, parameters: {Force: 12.5, Name: a, All: [1, true]}}\n";
-        let settings = Settings::from_yaml(text, Path::new("")).unwrap();
-        let Job::Sequence(parameters) = &settings.processes[0].work else {
-            panic!()
-        };
-        let expected = [
-            ("Force".to_owned(), serde_json::json!(12.5)),
-            ("Name".to_owned(), "a".into()),
-            ("All".to_owned(), serde_json::json!([1, true])),
-        ];
-        assert_eq!(parameters, &[expected.to_vec()]);
-    }
-}
+mod tests;

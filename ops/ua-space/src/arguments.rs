@@ -5,8 +5,8 @@ mod live;
 
 pub(crate) use discover::{Discover, Look};
 pub(crate) use live::{
-    Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, Skills, SkillsVerb, Target,
-    Trace, WatchSkills,
+    Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, Skills, SkillsVerb, Source,
+    SourceAt, SourceVerb, Target, Trace, WatchSkills,
 };
 
 use std::path::PathBuf;
@@ -158,6 +158,15 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, or an unknown question, 65 the query is wrong, 69 no answer in
     /// time, 74 a file cannot be read or the output cannot be written.
     Ask(Ask),
+    /// Change the sources of the knowledge of the plant while ua-mes runs
+    ///
+    /// Adds, replaces and removes NodeSets, manifests of modules, Turtle and processes. Sources that
+    /// the YAML of ua-mes names are changed there; SIGHUP reads them again.
+    ///
+    /// Exit codes: 0 done, 64 usage, or an unknown source, 65 the source is wrong, 69 no answer in
+    /// time, or the user may not change sources, 74 a file cannot be read or the output cannot be
+    /// written.
+    Source(Source),
     /// Print the completion script of a shell, which also completes names of skills and topics
     ///
     /// For bash: `source <(ua-space completion bash)`; for zsh likewise; for fish: `ua-space

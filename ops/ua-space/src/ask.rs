@@ -139,7 +139,7 @@ fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Failure> {
 }
 
 /// Returns the reason of a response with an error status.
-fn refusal(answer: &Answer) -> Failure {
+pub(crate) fn refusal(answer: &Answer) -> Failure {
     #[derive(Deserialize)]
     struct Told {
         error: String,

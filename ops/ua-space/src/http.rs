@@ -2,9 +2,11 @@
 
 use std::time::Duration;
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use http_body_util::{BodyExt as _, Full, Limited};
 use hyper::body::Bytes;
-use hyper::header::{ACCEPT, CONTENT_TYPE, HOST};
+use hyper::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST};
 use hyper::{Method, Request};
 use hyper_util::rt::TokioIo;
 use tokio::net::TcpStream;
@@ -17,6 +19,15 @@ pub(crate) struct Answer {
     pub(crate) status: u16,
     pub(crate) content_type: String,
     pub(crate) body: String,
+}
+
+/// A request that changes something.
+pub(crate) struct Change {
+    pub(crate) method: &'static str,
+    pub(crate) content_type: &'static str,
+    pub(crate) body: Vec<u8>,
+    /// The name and the password of the user.
+    pub(crate) user: Option<(String, String)>,
 }
 
 /// An HTTP server: `http://host:port`, or `host:port` alone.
@@ -70,14 +81,40 @@ impl Server {
         self.request(Method::POST, path, content).await
     }
 
+    /// Sends a change.
+    ///
+    /// # Errors
+    /// See [`get`](Self::get).
+    pub(crate) async fn change(&self, path: &str, change: Change) -> Result<Answer, Failure> {
+        let method = Method::from_bytes(change.method.as_bytes())
+            .map_err(|error| Failure::Usage(error.to_string()))?;
+        let content = (JSON, change.content_type, change.body.into());
+        let user = change.user.map(|(name, password)| {
+            let encoded = STANDARD.encode(format!("{name}:{password}"));
+            format!("Basic {encoded}")
+        });
+        self.request_as(method, path, content, (user, CHANGE_LIMIT))
+            .await
+    }
+
     async fn request(
         &self,
         method: Method,
         path: &str,
         content: (&str, &str, Bytes),
     ) -> Result<Answer, Failure> {
-        let asked = timeout(LIMIT, self.asked(method, path, content)).await;
-        let answer = asked.unwrap_or_else(|_| Err(format!("no answer within {LIMIT:?}")));
+        self.request_as(method, path, content, (None, LIMIT)).await
+    }
+
+    async fn request_as(
+        &self,
+        method: Method,
+        path: &str,
+        content: (&str, &str, Bytes),
+        (user, limit): (Option<String>, Duration),
+    ) -> Result<Answer, Failure> {
+        let asked = timeout(limit, self.asked(method, path, content, user)).await;
+        let answer = asked.unwrap_or_else(|_| Err(format!("no answer within {limit:?}")));
         answer.map_err(|why| {
             let help = "is it running, and is this its address?";
             Failure::Unavailable(format!(
@@ -92,6 +129,7 @@ impl Server {
         method: Method,
         path: &str,
         (accept, content_type, body): (&str, &str, Bytes),
+        user: Option<String>,
     ) -> Result<Answer, String> {
         let stream = TcpStream::connect(&self.authority)
             .await
@@ -107,6 +145,9 @@ impl Server {
             .header(ACCEPT, accept);
         if !content_type.is_empty() {
             request = request.header(CONTENT_TYPE, content_type);
+        }
+        if let Some(user) = user {
+            request = request.header(AUTHORIZATION, user);
         }
         let request = request
             .body(Full::new(body))
@@ -168,6 +209,8 @@ const JSON: &str = "application/json";
 const RESULTS: &str = "application/sparql-results+json, application/n-triples";
 /// The time limit of a request, longer than the time limit of a query.
 const LIMIT: Duration = Duration::from_secs(15);
+/// The time limit of a change, which may be large.
+const CHANGE_LIMIT: Duration = Duration::from_secs(60);
 const MOST_BYTES: usize = 32 << 20;
 
 #[cfg(test)]

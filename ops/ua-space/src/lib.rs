@@ -34,6 +34,7 @@ mod report;
 mod selector;
 mod session;
 mod shape;
+mod source;
 mod status;
 mod structures;
 mod survey;
@@ -83,6 +84,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Trace(arguments) => live::trace(arguments),
         Verb::Page(_) => return page::page(given),
         Verb::Ask(arguments) => ask::ask(arguments),
+        Verb::Source(arguments) => source::source(arguments),
         Verb::Completion(arguments) => completion::script(arguments.shell),
         Verb::Complete(arguments) => completion::complete(&arguments.words),
     };

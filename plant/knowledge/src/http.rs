@@ -1,5 +1,5 @@
-//! Queries over HTTP on loopback: the SPARQL 1.1 protocol (query only), named questions, and the
-//! statements themselves.
+//! The knowledge over HTTP on loopback: the SPARQL 1.1 protocol, named questions, the Graph Store
+//! Protocol, sources as files, and the statements themselves. `writes` has the changes.
 
 use std::convert::Infallible;
 use std::io;
@@ -10,7 +10,9 @@ use std::time::Duration;
 use bytes::Bytes;
 use http_body_util::{BodyExt as _, Full, LengthLimitError, Limited};
 use hyper::body::Incoming;
-use hyper::header::{ACCEPT, ALLOW, CONTENT_TYPE, HOST, HeaderValue, RETRY_AFTER};
+use hyper::header::{
+    ACCEPT, ALLOW, CONTENT_TYPE, HOST, HeaderValue, RETRY_AFTER, WWW_AUTHENTICATE,
+};
 use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
@@ -22,9 +24,11 @@ use tokio::sync::Semaphore;
 use tokio::task::JoinHandle;
 use tracing::debug;
 
+use crate::lanes::Lane;
 use crate::query::{Asked, Dataset, Formats, Limits, Queries, QueryFault, Results};
 use crate::question::{QUESTIONS, Question, QuestionFault};
 use crate::store::Knowledge;
+use crate::writes::{UPDATE, Writes, media, updated};
 
 /// Additional pages by their path: JSON, or `None` for an unknown page.
 pub type Page = Arc<dyn Fn(&str) -> Option<String> + Send + Sync>;
@@ -37,7 +41,7 @@ pub struct Endpoint {
 }
 
 impl Endpoint {
-    /// Listens at a loopback address; port 0 selects a free port.
+    /// Listens at a loopback address for queries; port 0 selects a free port.
     ///
     /// # Errors
     /// Fails if the address is in use, or is not a loopback address.
@@ -46,6 +50,20 @@ impl Endpoint {
         knowledge: Arc<Knowledge>,
         limits: Limits,
         page: Page,
+    ) -> io::Result<Self> {
+        Self::bind_with(address, knowledge, limits, page, None).await
+    }
+
+    /// Listens at a loopback address for queries, and for changes if `writes` has their handlers.
+    ///
+    /// # Errors
+    /// Fails if the address is in use, or is not a loopback address.
+    pub async fn bind_with(
+        address: SocketAddr,
+        knowledge: Arc<Knowledge>,
+        limits: Limits,
+        page: Page,
+        writes: Option<Writes>,
     ) -> io::Result<Self> {
         if !address.ip().is_loopback() {
             let why = format!(
@@ -59,6 +77,7 @@ impl Endpoint {
         let site = Site {
             queries: Queries::new(knowledge, limits),
             page,
+            writes,
         };
         Ok(Self {
             address,
@@ -80,9 +99,10 @@ impl Drop for Endpoint {
 }
 
 #[derive(Clone)]
-struct Site {
-    queries: Queries,
+pub(crate) struct Site {
+    pub(crate) queries: Queries,
     page: Page,
+    pub(crate) writes: Option<Writes>,
 }
 
 async fn accept(listener: TcpListener, site: Site) {
@@ -92,8 +112,8 @@ async fn accept(listener: TcpListener, site: Site) {
         let Ok(place) = Arc::clone(&places).acquire_owned().await else {
             return;
         };
-        let stream = match listener.accept().await {
-            Ok((stream, _)) => stream,
+        let (stream, peer) = match listener.accept().await {
+            Ok(accepted) => accepted,
             Err(error) => {
                 debug!(%error, "a connection for questions was not accepted");
                 tokio::time::sleep(ACCEPT_AGAIN).await;
@@ -103,7 +123,7 @@ async fn accept(listener: TcpListener, site: Site) {
         let site = site.clone();
         tokio::spawn(async move {
             let _place = place;
-            if tokio::time::timeout(CONNECTION_TIME, serve(stream, site))
+            if tokio::time::timeout(CONNECTION_TIME, serve(stream, peer.ip(), site))
                 .await
                 .is_err()
             {
@@ -113,10 +133,16 @@ async fn accept(listener: TcpListener, site: Site) {
     }
 }
 
-async fn serve(stream: TcpStream, site: Site) {
+async fn serve(stream: TcpStream, peer: IpAddr, site: Site) {
     let service = service_fn(|request| {
         let site = site.clone();
-        async move { Ok::<_, Infallible>(site.answer(request).await.unwrap_or_else(Refusal::response)) }
+        async move {
+            Ok::<_, Infallible>(
+                site.answer(request, peer)
+                    .await
+                    .unwrap_or_else(Refusal::response),
+            )
+        }
     });
     let served = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())
@@ -129,11 +155,21 @@ async fn serve(stream: TcpStream, site: Site) {
 }
 
 impl Site {
-    async fn answer(&self, request: Request<Incoming>) -> Result<Response<Full<Bytes>>, Refusal> {
+    async fn answer(
+        &self,
+        request: Request<Incoming>,
+        peer: IpAddr,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
         is_local(&request)?;
         let path = request.uri().path().to_owned();
-        if path == "/sparql" {
-            return self.sparql(request).await;
+        match path.as_str() {
+            "/sparql" => return self.sparql(request, peer).await,
+            "/update" => return self.update(request).await,
+            "/store" => return self.store(request).await,
+            path if path == "/sources" || path.starts_with("/sources/") => {
+                return self.sources(request).await;
+            }
+            _ => {}
         }
         if request.method() != Method::GET {
             return Err(Refusal::method("GET"));
@@ -150,7 +186,7 @@ impl Site {
                 None => match (self.page)(path) {
                     Some(page) => Ok(content(JSON, page.into_bytes())),
                     None => Err(Refusal::unknown(
-                        "there are /sparql, /ask, /ask/NAME, /graphs, /data and /status here"
+                        "there are /sparql, /update, /store, /sources, /ask, /ask/NAME, /graphs, /data and /status here"
                             .to_owned(),
                     )),
                 },
@@ -158,21 +194,18 @@ impl Site {
         }
     }
 
-    async fn sparql(&self, request: Request<Incoming>) -> Result<Response<Full<Bytes>>, Refusal> {
+    async fn sparql(
+        &self,
+        request: Request<Incoming>,
+        peer: IpAddr,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        if request.method() == Method::POST && media(&request) == UPDATE {
+            return self.update(request).await;
+        }
         let formats = Formats::of(&accepted(&request));
         let mut pairs = form(request.uri().query().unwrap_or_default())?;
         if request.method() == Method::POST {
-            let media = request
-                .headers()
-                .get(CONTENT_TYPE)
-                .and_then(|media| media.to_str().ok())
-                .unwrap_or_default();
-            let media = media
-                .split(';')
-                .next()
-                .unwrap_or_default()
-                .trim()
-                .to_ascii_lowercase();
+            let media = media(&request);
             let most = self.queries.limits().query;
             match media.as_str() {
                 "application/sparql-query" => {
@@ -182,7 +215,6 @@ impl Site {
                 "application/x-www-form-urlencoded" => {
                     pairs.extend(form(&body(request, most.saturating_mul(3)).await?)?)
                 }
-                "application/sparql-update" => return Err(QueryFault::NotAQuery.into()),
                 _ => {
                     let message = "a query is POSTed as application/sparql-query, or as query= in application/x-www-form-urlencoded";
                     return Err(Refusal::new(
@@ -216,7 +248,8 @@ impl Site {
         }
         let query =
             query.ok_or_else(|| Refusal::malformed("there is no query: give it as query="))?;
-        self.found(Asked::Sparql(query, dataset, formats)).await
+        self.found(Asked::Sparql(query, dataset, formats), Lane::Open(peer))
+            .await
     }
 
     async fn question(
@@ -244,13 +277,18 @@ impl Site {
         } else {
             Asked::Question(question, sparql)
         };
-        self.found(asked).await
+        self.found(asked, Lane::Named).await
     }
 
-    async fn found(&self, asked: Asked) -> Result<Response<Full<Bytes>>, Refusal> {
-        match self.queries.run(asked).await? {
+    pub(crate) async fn found(
+        &self,
+        asked: Asked,
+        lane: Lane,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        match self.queries.run(asked, lane).await? {
             Results::Written(media, bytes) => Ok(content(media, bytes)),
             Results::Answer(answer) => Ok(json_page(&json!(answer))),
+            Results::Updated(done) => Ok(updated(done.changed)),
         }
     }
 
@@ -297,7 +335,7 @@ impl Formats {
 
 /// Reason for refusing a request.
 #[derive(Debug)]
-struct Refusal {
+pub(crate) struct Refusal {
     status: StatusCode,
     code: &'static str,
     message: String,
@@ -305,7 +343,7 @@ struct Refusal {
 }
 
 impl Refusal {
-    fn new(status: StatusCode, code: &'static str, message: &str) -> Self {
+    pub(crate) fn new(status: StatusCode, code: &'static str, message: &str) -> Self {
         Self {
             status,
             code,
@@ -314,15 +352,15 @@ impl Refusal {
         }
     }
 
-    fn malformed(message: &str) -> Self {
+    pub(crate) fn malformed(message: &str) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "malformed", message)
     }
 
-    fn unknown(message: String) -> Self {
+    pub(crate) fn unknown(message: String) -> Self {
         Self::new(StatusCode::NOT_FOUND, "unknown", &message)
     }
 
-    fn method(allowed: &'static str) -> Self {
+    pub(crate) fn method(allowed: &'static str) -> Self {
         let message = format!("this is asked for by {allowed}");
         Self {
             allow: Some(allowed),
@@ -338,6 +376,12 @@ impl Refusal {
             response
                 .headers_mut()
                 .insert(ALLOW, HeaderValue::from_static(allow));
+        }
+        if self.status == StatusCode::UNAUTHORIZED {
+            response.headers_mut().insert(
+                WWW_AUTHENTICATE,
+                HeaderValue::from_static("Basic realm=\"ua-mes\""),
+            );
         }
         if self.status == StatusCode::SERVICE_UNAVAILABLE {
             response
@@ -355,7 +399,10 @@ impl From<QueryFault> for Refusal {
                 (StatusCode::BAD_REQUEST, "malformed")
             }
             QueryFault::NotAQuery => (StatusCode::BAD_REQUEST, "not_a_query"),
-            QueryFault::Service => (StatusCode::BAD_REQUEST, "service"),
+            QueryFault::Service | QueryFault::Load => (StatusCode::BAD_REQUEST, "service"),
+            QueryFault::ReadOnly => (StatusCode::FORBIDDEN, "read_only"),
+            QueryFault::Protected(_) => (StatusCode::FORBIDDEN, "protected"),
+            QueryFault::Change(_) => (StatusCode::INSUFFICIENT_STORAGE, "storage"),
             QueryFault::TooComplex(_) => (StatusCode::BAD_REQUEST, "too_complex"),
             QueryFault::TooLong { .. } => (StatusCode::PAYLOAD_TOO_LARGE, "too_large"),
             QueryFault::Time { .. } => (StatusCode::SERVICE_UNAVAILABLE, "time_limit"),
@@ -391,17 +438,7 @@ fn is_local(request: &Request<Incoming>) -> Result<(), Refusal> {
     let Some(host) = request.headers().get(HOST) else {
         return Ok(());
     };
-    let host = host.to_str().unwrap_or_default();
-    let name = match host.rsplit_once(':') {
-        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
-        _ => host,
-    };
-    let name = name.trim_start_matches('[').trim_end_matches(']');
-    let is_local = name == "localhost"
-        || name
-            .parse::<IpAddr>()
-            .is_ok_and(|address| address.is_loopback());
-    if is_local {
+    if is_loopback_host(host.to_str().unwrap_or_default()) {
         Ok(())
     } else {
         Err(Refusal::new(
@@ -412,8 +449,21 @@ fn is_local(request: &Request<Incoming>) -> Result<(), Refusal> {
     }
 }
 
+/// Returns whether a host with an optional port is a loopback name.
+pub(crate) fn is_loopback_host(host: &str) -> bool {
+    let name = match host.rsplit_once(':') {
+        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
+        _ => host,
+    };
+    let name = name.trim_start_matches('[').trim_end_matches(']');
+    name == "localhost"
+        || name
+            .parse::<IpAddr>()
+            .is_ok_and(|address| address.is_loopback())
+}
+
 /// Returns the accepted media types in order, without refused types (q=0).
-fn accepted(request: &Request<Incoming>) -> Vec<String> {
+pub(crate) fn accepted(request: &Request<Incoming>) -> Vec<String> {
     let all = request
         .headers()
         .get_all(ACCEPT)
@@ -453,7 +503,7 @@ async fn body(request: Request<Incoming>, most: usize) -> Result<String, Refusal
 }
 
 /// Returns the pairs of a form or of the query of a URL.
-fn form(text: &str) -> Result<Vec<(String, String)>, Refusal> {
+pub(crate) fn form(text: &str) -> Result<Vec<(String, String)>, Refusal> {
     let pairs: Vec<&str> = text.split('&').filter(|pair| !pair.is_empty()).collect();
     if pairs.len() > MAX_PAIRS {
         return Err(Refusal::malformed("there are too many parameters"));
@@ -466,7 +516,7 @@ fn form(text: &str) -> Result<Vec<(String, String)>, Refusal> {
     pairs.ok_or_else(|| Refusal::malformed("a parameter is not escaped as %XX of UTF-8"))
 }
 
-fn unescaped(text: &str) -> Option<String> {
+pub(crate) fn unescaped(text: &str) -> Option<String> {
     let mut bytes = Vec::with_capacity(text.len());
     let mut rest = text.bytes();
     while let Some(byte) = rest.next() {
@@ -501,13 +551,13 @@ fn catalogue() -> serde_json::Value {
     json!({ "questions": questions.collect::<Vec<_>>() })
 }
 
-fn json_page(page: &serde_json::Value) -> Response<Full<Bytes>> {
+pub(crate) fn json_page(page: &serde_json::Value) -> Response<Full<Bytes>> {
     let mut text = page.to_string();
     text.push('\n');
     content(JSON, text.into_bytes())
 }
 
-fn content(media: &'static str, bytes: Vec<u8>) -> Response<Full<Bytes>> {
+pub(crate) fn content(media: &'static str, bytes: Vec<u8>) -> Response<Full<Bytes>> {
     let mut response = Response::new(Full::new(bytes.into()));
     response
         .headers_mut()
@@ -516,12 +566,14 @@ fn content(media: &'static str, bytes: Vec<u8>) -> Response<Full<Bytes>> {
 }
 
 const JSON: &str = "application/json";
-const MAX_CONNECTIONS: usize = 64;
+const MAX_CONNECTIONS: usize = 256;
 const MAX_PAIRS: usize = 256;
 const MAX_GRAPHS: usize = 100;
 const MAX_MEDIA: usize = 32;
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 const HEADER_TIME: Duration = Duration::from_secs(5);
 const BODY_TIME: Duration = Duration::from_secs(5);
+/// Time for the body of a change.
+pub(crate) const UPLOAD_TIME: Duration = Duration::from_secs(45);
 /// Exceeds the time limit of any query.
 const CONNECTION_TIME: Duration = Duration::from_secs(60);

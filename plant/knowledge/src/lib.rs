@@ -6,21 +6,30 @@
 //! source. Queries are SPARQL ([`QUESTIONS`] are named queries); [`Endpoint`] serves them over
 //! HTTP, with limits of time, memory and size.
 //!
+//! Users write graphs of their own by SPARQL 1.1 Update and the Graph Store Protocol. Lasting
+//! sources are stored in a journal.
+//!
 //! This crate calls no server and discovers nothing: facts are plain data with the name of their
 //! source.
 //!
-//! Reading order: `source` (the named graphs), `store` (replacement and derivation), `component`
-//! and `nodeset` (facts to statements), `question` (named queries), `query` and `bounds` (any
-//! SPARQL, within limits), `http`.
+//! Reading order: `source` (the named graphs), `store`, `writing` (replacement and derivation) and
+//! `journal` (lasting sources), `component` and `nodeset` (facts to statements), `question` (named
+//! queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the queries that run at a
+//! time), `http`, `update` and `writes` (changes by users).
 
 mod bounds;
 mod component;
 mod http;
+mod journal;
+mod lanes;
 pub mod nodeset;
 mod query;
 mod question;
 mod source;
 mod store;
+mod update;
+mod writes;
+mod writing;
 
 pub use component::{
     ComponentFacts, NodeName, OPC_UA, ParameterFacts, SkillFacts, TypeFacts, is_iri,
@@ -30,4 +39,16 @@ pub use mtp::vocabulary;
 pub use query::Limits;
 pub use question::{Answer, QUESTIONS, Question, QuestionFault};
 pub use source::{Source, SourceKind};
-pub use store::{Knowledge, KnowledgeFault, SourceStatus};
+pub use store::{Knowledge, KnowledgeFault, Lasting, SourceStatus};
+pub use writes::{May, SourceFiles, Writes};
+
+/// Returns an empty folder for a test.
+#[cfg(test)]
+fn test_folder(name: &str) -> std::path::PathBuf {
+    let folder = std::env::temp_dir().join(format!("knowledge-{name}-{}", std::process::id()));
+    if folder.exists() {
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+    std::fs::create_dir_all(&folder).unwrap();
+    folder
+}

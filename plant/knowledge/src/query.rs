@@ -2,7 +2,7 @@
 //!
 //! Each query has a thread of its own, because the evaluator never yields, and the parser needs a
 //! stack for nesting. A query beyond its time limit is cancelled and reported as such; it counts as
-//! running until its thread has ended.
+//! running until its thread has ended. `lanes` decides which queries run.
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -17,18 +17,22 @@ use oxigraph::sparql::{
 };
 use spargebra::SparqlParser;
 use thiserror::Error;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
+use tokio::sync::oneshot;
+use tokio::time::Instant;
 
 use crate::bounds;
+use crate::lanes::{Lane, Lanes};
 use crate::question::{Answer, Question};
-use crate::store::Knowledge;
+use crate::store::{Knowledge, KnowledgeFault};
+use crate::update::{self, Updated};
 
 /// Limits of a query.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
     /// Time limit.
     pub time: Duration,
-    /// Maximum number of concurrent queries.
+    /// Maximum number of concurrent queries that take longer than a moment. A client can have half
+    /// of them.
     pub parallel: usize,
     /// Maximum number of rows or statements in a result.
     pub rows: usize,
@@ -36,7 +40,7 @@ pub struct Limits {
     pub bytes: usize,
     /// Maximum size of a query in bytes.
     pub query: usize,
-    /// Maximum growth of the program in bytes while the query runs.
+    /// Maximum growth of the program in bytes while queries run, of all of them together.
     pub memory: u64,
 }
 
@@ -79,6 +83,8 @@ pub(crate) enum Results {
     Written(&'static str, Vec<u8>),
     /// Result of a named question.
     Answer(Answer),
+    /// Result of an update.
+    Updated(Updated),
 }
 
 /// Error of a query.
@@ -90,9 +96,23 @@ pub(crate) enum QueryFault {
     Malformed(String),
     /// The text is an update.
     #[error(
-        "only SELECT, ASK, CONSTRUCT and DESCRIBE are answered; what is known is changed by its sources alone"
+        "this is an update: POST it to /update as application/sparql-update, or as update= in application/x-www-form-urlencoded"
     )]
     NotAQuery,
+    /// Updates are not served.
+    #[error("updates are not served here")]
+    ReadOnly,
+    /// The update reads another server.
+    #[error(
+        "LOAD is not run: no other server is asked from here; PUT the document to /store?graph=IRI"
+    )]
+    Load,
+    /// The graph is read-only.
+    #[error("{0}")]
+    Protected(String),
+    /// The change was not made.
+    #[error("{0}")]
+    Change(String),
     /// The query calls another server.
     #[error("SERVICE is not answered: no other server is asked from here")]
     Service,
@@ -115,13 +135,15 @@ pub(crate) enum QueryFault {
         limit: Duration,
     },
     /// The query used too much memory.
-    #[error("the query took more than {} MiB of memory and was stopped; narrow it down", limit >> 20)]
+    #[error("the queries took more than {} MiB of memory, and the oldest, this one, was stopped; narrow it down", limit >> 20)]
     Memory {
         /// The limit.
         limit: u64,
     },
     /// Too many queries are running.
-    #[error("{0} queries run at this time, and no more are taken; ask again")]
+    #[error(
+        "{0} long queries can run at a time, half of them for one client, and all are in use; ask again"
+    )]
     Busy(usize),
     /// The result is too large.
     #[error("the result is larger than {rows} rows or {bytes} bytes; add a LIMIT")]
@@ -146,6 +168,24 @@ pub(crate) enum Asked {
     Sparql(String, Dataset, Formats),
     /// A question with its parameters filled in, for an answer in plain JSON.
     Question(Question, String),
+    /// An update at a time in milliseconds since 1970.
+    Update(String, u64),
+}
+
+impl From<KnowledgeFault> for QueryFault {
+    fn from(fault: KnowledgeFault) -> Self {
+        match fault {
+            KnowledgeFault::Protected(_) | KnowledgeFault::Derived => {
+                Self::Protected(fault.to_string())
+            }
+            KnowledgeFault::Iri { .. }
+            | KnowledgeFault::TooMany { .. }
+            | KnowledgeFault::TooManySources { .. }
+            | KnowledgeFault::Turtle(_)
+            | KnowledgeFault::Journal(_)
+            | KnowledgeFault::Store(_) => Self::Change(fault.to_string()),
+        }
+    }
 }
 
 /// The running queries.
@@ -153,7 +193,7 @@ pub(crate) enum Asked {
 pub(crate) struct Queries {
     knowledge: Arc<Knowledge>,
     limits: Limits,
-    places: Arc<Semaphore>,
+    lanes: Arc<Lanes>,
 }
 
 impl Queries {
@@ -161,7 +201,7 @@ impl Queries {
         Self {
             knowledge,
             limits,
-            places: Arc::new(Semaphore::new(limits.parallel)),
+            lanes: Lanes::new(limits.parallel),
         }
     }
 
@@ -174,55 +214,73 @@ impl Queries {
     }
 
     /// Runs a query. Dropping the future stops the query.
-    pub(crate) async fn run(&self, asked: Asked) -> Result<Results, QueryFault> {
+    pub(crate) async fn run(&self, asked: Asked, lane: Lane) -> Result<Results, QueryFault> {
         let limits = self.limits;
-        if let Asked::Sparql(query, ..) = &asked
-            && query.len() > limits.query
-        {
-            return Err(QueryFault::TooLong { most: limits.query });
-        }
-        let busy = QueryFault::Busy(limits.parallel);
-        let place = Arc::clone(&self.places)
-            .try_acquire_owned()
-            .map_err(|_none| busy.clone())?;
-        let running = Stopping(CancellationToken::new());
+        let text = match &asked {
+            Asked::Sparql(query, ..) if query.len() > limits.query => {
+                return Err(QueryFault::TooLong { most: limits.query });
+            }
+            Asked::Update(text, _) if text.len() > LARGEST_UPDATE => {
+                return Err(QueryFault::TooLong {
+                    most: LARGEST_UPDATE,
+                });
+            }
+            Asked::Sparql(text, ..) | Asked::Question(_, text) | Asked::Update(text, _) => {
+                text.clone()
+            }
+        };
+        let seat = self.lanes.enter(lane, &text, resident()).await?;
+        let watch = self.lanes.watch(&seat);
         let (tell, mut told) = oneshot::channel();
+        let token = CancellationToken::new();
+        let running = Stopping(token.clone());
         let work = Work {
             knowledge: Arc::clone(&self.knowledge),
             asked,
             limits,
-            token: running.0.clone(),
+            token,
         };
         let thread = std::thread::Builder::new()
             .name("sparql".to_owned())
             .stack_size(STACK);
         let started = thread.spawn(move || {
-            let _place: OwnedSemaphorePermit = place;
+            let _seat = seat;
             // The receiver may have been dropped.
             let _told = tell.send(work.run());
         });
         if started.is_err() {
-            return Err(busy);
+            return Err(QueryFault::Busy(limits.parallel));
         }
-        let before = resident();
+        let begin = Instant::now();
         let mut looks = tokio::time::interval(LOOK);
         let over = tokio::time::sleep(limits.time);
         tokio::pin!(over);
-        loop {
+        let fault = loop {
             tokio::select! {
                 result = &mut told => {
+                    watch.ended(&text, begin.elapsed());
                     return result.unwrap_or_else(|_gone| Err(QueryFault::Failed("its thread ended".to_owned())));
                 }
-                () = &mut over => return Err(QueryFault::Time { limit: limits.time }),
+                () = &mut over => break QueryFault::Time { limit: limits.time },
                 _ = looks.tick() => {
-                    if let (Some(before), Some(now)) = (before, resident())
-                        && now.saturating_sub(before) > limits.memory
-                    {
-                        return Err(QueryFault::Memory { limit: limits.memory });
+                    if watch.exceeds(resident(), limits.memory) {
+                        break QueryFault::Memory { limit: limits.memory };
+                    }
+                    if let Err(fault) = watch.lengthen(begin.elapsed()) {
+                        break fault;
                     }
                 }
             }
+        };
+        drop(running);
+        watch.stopped();
+        if lane == Lane::Write {
+            // The update may have been made in the last moment.
+            if let Ok(Ok(done)) = told.await {
+                return Ok(done);
+            }
         }
+        Err(fault)
     }
 }
 
@@ -248,6 +306,18 @@ impl Work {
         let (text, dataset) = match &self.asked {
             Asked::Sparql(text, dataset, _) => (text, dataset.clone()),
             Asked::Question(_, text) => (text, Dataset::default()),
+            Asked::Update(text, at) => {
+                let update = update::read(text)?;
+                let updated = self.knowledge.update(&update, &self.token, *at);
+                return match updated {
+                    Err(QueryFault::Failed(_)) if self.token.is_cancelled() => {
+                        Err(QueryFault::Time {
+                            limit: self.limits.time,
+                        })
+                    }
+                    updated => updated.map(Results::Updated),
+                };
+            }
         };
         bounds::nests(text)?;
         let query = match SparqlParser::new().parse_query(text) {
@@ -311,6 +381,7 @@ impl Work {
                     .triples
                     .ok_or(QueryFault::NotAcceptable("CONSTRUCT"))?,
             ),
+            (_, Asked::Update(..)) => Err(QueryFault::ReadOnly),
             (QueryResults::Boolean(_) | QueryResults::Graph(_), Asked::Question(question, _)) => {
                 Err(QueryFault::Failed(format!(
                     "the question `{}` is no SELECT",
@@ -423,7 +494,65 @@ fn resident() -> Option<u64> {
     Some(kilobytes << 10)
 }
 
-/// Period of the memory checks.
-const LOOK: Duration = Duration::from_millis(50);
+/// Period of the checks of memory and places.
+const LOOK: Duration = Duration::from_millis(25);
 /// Memory is allocated only for the used part.
 const STACK: usize = 256 << 20;
+/// An update may contain many statements.
+pub(crate) const LARGEST_UPDATE: usize = 16 << 20;
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use super::*;
+    use crate::source::{Source, SourceKind};
+
+    /// Queries that work on tuples without reading statements, or hold many tuples.
+    const LONG: [&str; 9] = [
+        "SELECT (COUNT(*) AS ?n) {?a ?b ?c . ?d ?e ?f . ?g ?h ?i}",
+        "SELECT (COUNT(*) AS ?n) {{?a ?b ?c} {?d ?e ?f} {?g ?h ?i}}",
+        "SELECT (MAX(?c) AS ?m) {?a ?b ?c . ?d ?e ?f . ?g ?h ?i}",
+        "SELECT ?a {?a ?b ?c . ?d ?e ?f . ?g ?h ?i FILTER(?c = CONCAT(STR(?f), STR(?i), 'x'))}",
+        "SELECT (COUNT(*) AS ?n) {?a ?b ?c OPTIONAL {?d ?e ?f OPTIONAL {?g ?h ?i}}}",
+        "SELECT ?a {?a ?b ?c . ?d ?e ?f . ?g ?h ?i} ORDER BY ?f ?c",
+        "SELECT DISTINCT ?a ?d ?g {?a ?b ?c . ?d ?e ?f . ?g ?h ?i}",
+        "SELECT (COUNT(*) AS ?n) {?a (!<a:b>)* ?b . ?b (!<a:c>)* ?c . ?d (!<a:b>)* ?e}",
+        "ASK {?a ?b ?c . ?d ?e ?f . ?g ?h ?i MINUS {?j ?k ?c . ?l ?m ?f FILTER(?j != ?l)} FILTER(?a = ?b)}",
+    ];
+
+    #[tokio::test]
+    async fn the_thread_of_a_stopped_query_ends() {
+        let knowledge = Arc::new(Knowledge::new().unwrap());
+        let many: String = (0..3000)
+            .map(|number| format!("<urn:s{number}> <urn:p> <urn:s{}> .\n", (number * 7) % 3000))
+            .collect();
+        let source = Source::new(SourceKind::File, "many");
+        knowledge.replace_turtle(&source, &many, 5).unwrap();
+        let limits = Limits {
+            time: Duration::from_millis(1000),
+            ..Limits::default()
+        };
+        let queries = Queries::new(knowledge, limits);
+        let formats = Formats {
+            solutions: Some(QueryResultsFormat::Json),
+            triples: None,
+        };
+        for text in LONG {
+            let asked = Asked::Sparql(text.to_owned(), Dataset::default(), formats);
+            let result = queries.run(asked, Lane::Open(Ipv4Addr::LOCALHOST.into()));
+            let fault = result.await.unwrap_err();
+            let is_stopped = matches!(
+                fault,
+                QueryFault::Time { .. } | QueryFault::Memory { .. } | QueryFault::Result { .. }
+            );
+            assert!(is_stopped, "{text}: {fault}");
+            // Without the check in each operator the thread works for minutes.
+            let deadline = Instant::now() + Duration::from_secs(10);
+            while queries.lanes.running() > 0 {
+                assert!(Instant::now() < deadline, "its thread goes on: {text}");
+                tokio::time::sleep(LOOK).await;
+            }
+        }
+    }
+}

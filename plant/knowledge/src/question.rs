@@ -96,6 +96,14 @@ pub const QUESTIONS: &[Question] = &[
         sparql: include_str!("../queries/parameters.rq"),
     },
     Question {
+        name: "process-parameters",
+        sparql: include_str!("../queries/process-parameters.rq"),
+    },
+    Question {
+        name: "process-steps",
+        sparql: include_str!("../queries/process-steps.rq"),
+    },
+    Question {
         name: "processes",
         sparql: include_str!("../queries/processes.rq"),
     },

@@ -1,6 +1,7 @@
 //! The sources of statements: each source has a named graph of its own.
 
 use std::fmt;
+use std::str::FromStr;
 
 use mtp::escaped;
 use serde::Serialize;
@@ -30,6 +31,8 @@ pub enum SourceKind {
     Process,
     /// A run of a process.
     Run,
+    /// A graph that users write; its name is its IRI.
+    Graph,
     /// The results of the rules, which are read-only.
     Derived,
 }
@@ -50,6 +53,9 @@ impl Source {
         if self.kind == SourceKind::Derived {
             return DERIVED.to_owned();
         }
+        if self.kind == SourceKind::Graph {
+            return self.name.clone();
+        }
         format!("urn:ua-bridge:graph:{}:{}", self.kind, escaped(&self.name))
     }
 }
@@ -63,10 +69,32 @@ impl fmt::Display for SourceKind {
             Self::File => "file",
             Self::Process => "process",
             Self::Run => "run",
+            Self::Graph => "graph",
             Self::Derived => "derived",
         })
     }
 }
 
+impl FromStr for SourceKind {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        let all = [
+            Self::Component,
+            Self::Mtp,
+            Self::NodeSet,
+            Self::File,
+            Self::Process,
+            Self::Run,
+            Self::Graph,
+        ];
+        all.into_iter()
+            .find(|kind| kind.to_string() == text)
+            .ok_or(())
+    }
+}
+
+/// The graph of statements that users write without naming a graph.
+pub(crate) const UNNAMED: &str = "urn:ua-bridge:graph:unnamed";
 /// The graph of derived statements.
 pub(crate) const DERIVED: &str = "urn:ua-bridge:graph:derived";

@@ -1,22 +1,25 @@
 //! The store: a named graph per source, and the merge of all graphs as the default graph.
 
-use std::collections::{BTreeMap, BTreeSet, HashSet};
-use std::sync::{Mutex, PoisonError};
+use std::collections::{BTreeMap, HashSet};
+use std::path::Path;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::{fmt, io};
 
 use mtp::{Object, Triple as Statement};
-use oxigraph::io::{RdfFormat, RdfParser, RdfSerializer};
+use oxigraph::io::{RdfFormat, RdfParser, RdfSerializer, RdfSyntaxError};
 use oxigraph::model::{
-    GraphName, GraphNameRef, Literal, NamedNode, NamedNodeRef, NamedOrBlankNode, Term, Triple,
-    vocab,
+    GraphNameRef, Literal, NamedNode, NamedNodeRef, NamedOrBlankNode, NamedOrBlankNodeRef, Term,
+    TermRef, Triple, vocab,
 };
-use oxigraph::store::{StorageError, Store, Transaction};
+use oxigraph::store::{StorageError, Store};
 use serde::Serialize;
 use thiserror::Error;
 use tokio::sync::watch;
 
-use crate::source::{DERIVED, Source, SourceKind};
+use crate::journal::Journal;
+use crate::source::{Source, SourceKind};
 use crate::vocabulary;
+use crate::writing::{Change, Writing, derive};
 
 /// Error of adding data to the store.
 #[derive(Debug, Error)]
@@ -48,6 +51,14 @@ pub enum KnowledgeFault {
     /// The graph of derived statements is read-only.
     #[error("the derived graph is made by rules and cannot be written")]
     Derived,
+    /// The graph belongs to a source of another kind.
+    #[error(
+        "the graph {0} is made from its source and cannot be written; write a graph with a name of your own"
+    )]
+    Protected(String),
+    /// The journal failed.
+    #[error("the change cannot be stored: {0}")]
+    Journal(#[from] io::Error),
     /// The store itself failed.
     #[error("the store fails: {0}")]
     Store(#[from] StorageError),
@@ -61,8 +72,24 @@ pub enum KnowledgeFault {
 pub struct Knowledge {
     store: Store,
     /// Serializes the writers.
-    sources: Mutex<BTreeMap<Source, SourceStatus>>,
+    written: Mutex<Written>,
     changed: watch::Sender<u64>,
+}
+
+/// The sources of the statements, and the journal of the lasting sources.
+#[derive(Debug, Default)]
+pub(crate) struct Written {
+    pub(crate) sources: BTreeMap<Source, SourceStatus>,
+    pub(crate) journal: Option<Journal>,
+}
+
+/// Whether a source outlasts the program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Lasting {
+    /// It is read again from its origin when the program starts.
+    No,
+    /// It is stored, if the knowledge has a journal.
+    Yes,
 }
 
 /// Status of a source.
@@ -76,6 +103,8 @@ pub struct SourceStatus {
     pub name: String,
     /// Number of its statements.
     pub statements: usize,
+    /// Whether it is stored and outlasts the program.
+    pub lasting: bool,
     /// Time of its first addition in milliseconds since 1970; a replacement keeps it.
     pub since_ms: u64,
 }
@@ -88,9 +117,42 @@ impl Knowledge {
     pub fn new() -> Result<Self, KnowledgeFault> {
         Ok(Self {
             store: Store::new()?,
-            sources: Mutex::new(BTreeMap::new()),
+            written: Mutex::default(),
             changed: watch::channel(0).0,
         })
+    }
+
+    /// Creates a store in memory, with the lasting sources of the journal in a folder. Returns it
+    /// with the number of bytes of the journal that could not be read and were set aside.
+    ///
+    /// # Errors
+    /// Fails if the folder cannot be read or written, or another program uses it.
+    pub fn open(folder: &Path) -> Result<(Self, u64), KnowledgeFault> {
+        let (journal, restored) = Journal::open(folder)?;
+        let knowledge = Self::new()?;
+        let mut written = knowledge.written();
+        for (source, graph) in restored.graphs {
+            let mut transaction = knowledge.store.start_transaction()?;
+            let name = named(&source.graph())?;
+            for triple in &graph.triples {
+                transaction.insert(triple.as_ref().in_graph(&name));
+                transaction.insert(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
+            }
+            transaction.commit()?;
+            let status = SourceStatus::new(&source, graph.at);
+            let status = written.sources.entry(source).or_insert(status);
+            status.statements = graph.triples.len();
+            status.lasting = true;
+        }
+        let mut transaction = knowledge.store.start_transaction()?;
+        let derived = derive(&mut transaction)?;
+        transaction.commit()?;
+        if !written.sources.is_empty() {
+            written.count_derived(derived);
+        }
+        written.journal = Some(journal);
+        drop(written);
+        Ok((knowledge, restored.damaged))
     }
 
     /// Replaces the statements of a source atomically for all readers. `at` is in milliseconds
@@ -104,16 +166,21 @@ impl Knowledge {
         statements: &[Statement],
         at: u64,
     ) -> Result<(), KnowledgeFault> {
-        if statements.len() > MAX_STATEMENTS {
-            return Err(KnowledgeFault::TooMany {
-                most: MAX_STATEMENTS,
-            });
-        }
-        let statements = statements
-            .iter()
-            .map(triple)
-            .collect::<Result<HashSet<_>, _>>()?;
-        self.put(source, &statements, at)
+        self.replace_with(source, statements, (at, Lasting::No))
+    }
+
+    /// Replaces the statements of a source, and stores them if the source lasts.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`]; then nothing has changed.
+    pub fn replace_with(
+        &self,
+        source: &Source,
+        statements: &[Statement],
+        (at, lasting): (u64, Lasting),
+    ) -> Result<(), KnowledgeFault> {
+        let triples = statements.iter().map(triple);
+        self.put(source, triples.collect::<Result<_, _>>()?, (at, lasting))
     }
 
     /// Replaces the statements of a source by the statements of a Turtle file.
@@ -126,45 +193,115 @@ impl Knowledge {
         turtle: &str,
         at: u64,
     ) -> Result<(), KnowledgeFault> {
-        let mut triples = HashSet::new();
-        for quad in RdfParser::from_format(RdfFormat::Turtle)
-            .rename_blank_nodes()
-            .for_slice(turtle)
-        {
-            let quad = quad.map_err(|error| KnowledgeFault::Turtle(error.to_string()))?;
-            triples.insert(Triple::from(quad));
-            if triples.len() > MAX_STATEMENTS {
-                return Err(KnowledgeFault::TooMany {
-                    most: MAX_STATEMENTS,
-                });
-            }
+        let triples = parsed(RdfFormat::Turtle, turtle.as_bytes())?;
+        self.put(source, triples, (at, Lasting::No))
+    }
+
+    /// Adds the statements of a document to a source, or replaces those of the source, and stores
+    /// them if the source lasts. Returns whether the source is new.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`]; then nothing has changed.
+    pub(crate) fn take(
+        &self,
+        source: &Source,
+        (format, document): (RdfFormat, &[u8]),
+        adds: bool,
+        at: u64,
+    ) -> Result<bool, KnowledgeFault> {
+        let triples = parsed(format, document)?;
+        let is_new = !self.written().sources.contains_key(source);
+        if adds {
+            let change = Change {
+                removed: Vec::new(),
+                added: triples.into_iter().collect(),
+            };
+            let mut writing = self.write()?;
+            writing.change(source, change)?;
+            writing.commit(at)?;
+        } else {
+            self.put(source, triples, (at, Lasting::Yes))?;
         }
-        self.put(source, &triples, at)
+        Ok(is_new)
+    }
+
+    /// Replaces the statements of a lasting source by those of a Turtle document.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`]; then nothing has changed.
+    pub fn take_turtle(
+        &self,
+        source: &Source,
+        turtle: &str,
+        at: u64,
+    ) -> Result<(), KnowledgeFault> {
+        let document = (RdfFormat::Turtle, turtle.as_bytes());
+        self.take(source, document, false, at).map(drop)
     }
 
     /// Removes a source atomically for all readers. Returns whether it existed.
     ///
     /// # Errors
-    /// [`KnowledgeFault::Store`]; then nothing has changed.
+    /// [`KnowledgeFault`]; then nothing has changed.
     pub fn remove(&self, source: &Source) -> Result<bool, KnowledgeFault> {
-        let mut sources = self.sources.lock().unwrap_or_else(PoisonError::into_inner);
-        if !sources.contains_key(source) {
+        let mut writing = self.write()?;
+        if !writing.written.sources.contains_key(source) {
             return Ok(false);
         }
-        self.write(&source.graph(), &HashSet::new())?;
-        sources.remove(source);
-        self.tell(&mut sources);
+        let of_graph = writing.triples(source)?;
+        let change = Change {
+            removed: of_graph.into_iter().collect(),
+            added: Vec::new(),
+        };
+        writing.change(source, change)?;
+        writing.remove(source);
+        writing.commit(0)?;
         Ok(true)
     }
 
     /// Returns the sources with their times.
     pub fn sources(&self) -> Vec<SourceStatus> {
-        self.sources
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .values()
-            .cloned()
-            .collect()
+        self.written().sources.values().cloned().collect()
+    }
+
+    fn written(&self) -> MutexGuard<'_, Written> {
+        self.written.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Begins a change of any number of sources, which readers see as a whole.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault::Store`].
+    pub(crate) fn write(&self) -> Result<Writing<'_>, KnowledgeFault> {
+        // The sources are locked first: a transaction waits for others without end.
+        let written = self.written();
+        let transaction = self.store.start_transaction()?;
+        Ok(Writing::new(written, transaction, &self.changed))
+    }
+
+    /// Returns the IRI of a type by its namespace and BrowseName, if a source has it.
+    pub fn type_of(&self, namespace: &str, browse_name: &str) -> Option<String> {
+        let find = |subject: Option<NamedOrBlankNodeRef<'_>>, predicate: &str, text: &str| {
+            let predicate = NamedNodeRef::new_unchecked(predicate);
+            let text = Literal::new_simple_literal(text);
+            let object = TermRef::from(&text);
+            let quads = self
+                .store
+                .quads_for_pattern(subject, Some(predicate), Some(object), None);
+            quads.flatten().map(|quad| quad.subject).collect::<Vec<_>>()
+        };
+        let named = find(None, vocabulary::BROWSE_NAME, browse_name);
+        named.into_iter().find_map(|subject| {
+            let of = find(
+                Some(subject.as_ref()),
+                vocabulary::NODE_NAMESPACE,
+                namespace,
+            );
+            match subject {
+                NamedOrBlankNode::NamedNode(node) if !of.is_empty() => Some(node.into_string()),
+                NamedOrBlankNode::NamedNode(_) | NamedOrBlankNode::BlankNode(_) => None,
+            }
+        })
     }
 
     /// Returns a number that increases with each change.
@@ -201,6 +338,33 @@ impl Knowledge {
         Ok(Some(()))
     }
 
+    /// Writes the statements of a graph. Returns `None` if there is no such graph.
+    ///
+    /// # Errors
+    /// Fails if the store fails.
+    pub(crate) fn write_triples(
+        &self,
+        graph: &str,
+        format: RdfFormat,
+    ) -> io::Result<Option<Vec<u8>>> {
+        let graph = NamedNodeRef::new(graph).map_err(io::Error::other)?;
+        if !self
+            .store
+            .contains_named_graph(graph)
+            .map_err(io::Error::other)?
+        {
+            return Ok(None);
+        }
+        let mut to = RdfSerializer::from_format(format).for_writer(Vec::new());
+        for quad in self
+            .store
+            .quads_for_pattern(None, None, None, Some(graph.into()))
+        {
+            to.serialize_triple(&Triple::from(quad.map_err(io::Error::other)?))?;
+        }
+        Ok(Some(to.finish()?))
+    }
+
     pub(crate) fn store(&self) -> &Store {
         &self.store
     }
@@ -208,191 +372,78 @@ impl Knowledge {
     fn put(
         &self,
         source: &Source,
-        triples: &HashSet<Triple>,
-        at: u64,
+        triples: HashSet<Triple>,
+        (at, lasting): (u64, Lasting),
     ) -> Result<(), KnowledgeFault> {
-        if source.kind == SourceKind::Derived {
-            return Err(KnowledgeFault::Derived);
-        }
-        let mut sources = self.sources.lock().unwrap_or_else(PoisonError::into_inner);
-        if sources.len() >= MAX_SOURCES && !sources.contains_key(source) {
-            return Err(KnowledgeFault::TooManySources { most: MAX_SOURCES });
-        }
-        let graph = source.graph();
-        self.write(&graph, triples)?;
-        let status = sources
-            .entry(source.clone())
-            .or_insert_with(|| SourceStatus {
-                graph,
-                kind: source.kind,
-                name: source.name.clone(),
-                statements: 0,
-                since_ms: at,
+        if triples.len() > MAX_STATEMENTS {
+            return Err(KnowledgeFault::TooMany {
+                most: MAX_STATEMENTS,
             });
-        status.statements = triples.len();
-        self.tell(&mut sources);
-        Ok(())
-    }
-
-    /// Updates the count of derived statements, and notifies the receivers of changes.
-    fn tell(&self, sources: &mut BTreeMap<Source, SourceStatus>) {
-        let derived = NamedNodeRef::new_unchecked(DERIVED);
-        let statements = self
-            .store
-            .quads_for_pattern(None, None, None, Some(derived.into()))
-            .count();
-        let since_ms = sources
-            .values()
-            .map(|source| source.since_ms)
-            .min()
-            .unwrap_or_default();
-        sources.insert(
-            Source::new(SourceKind::Derived, ""),
-            SourceStatus {
-                graph: DERIVED.to_owned(),
-                kind: SourceKind::Derived,
-                name: String::new(),
-                statements,
-                since_ms,
-            },
-        );
-        self.changed.send_modify(|changes| *changes += 1);
-    }
-
-    /// Replaces the contents of a graph by `triples`, and updates the default graph and the derived
-    /// graph, in a single transaction.
-    fn write(&self, graph: &str, triples: &HashSet<Triple>) -> Result<(), KnowledgeFault> {
-        let graph = named(graph)?;
-        let sub_class = NamedNodeRef::new_unchecked(vocabulary::RDFS_SUB_CLASS_OF);
-        let mut transaction = self.store.start_transaction()?;
-        let is_about_classes =
-            |changed: &[Triple]| changed.iter().any(|triple| triple.predicate == sub_class);
-        let (added, removed) = difference(&transaction, &graph, triples)?;
-        apply(&mut transaction, &graph, &added, &removed)?;
-        if is_about_classes(&added) || is_about_classes(&removed) {
-            let derived = named(DERIVED)?;
-            let closure = closure(&transaction, sub_class, &derived)?;
-            let (added, removed) = difference(&transaction, &derived, &closure)?;
-            apply(&mut transaction, &derived, &added, &removed)?;
         }
-        transaction.commit()?;
-        Ok(())
+        let mut writing = self.write()?;
+        writing.lasting = lasting;
+        writing.replace(source, triples)?;
+        writing.commit(at)
+    }
+}
+
+impl Written {
+    /// Updates the status of the derived statements.
+    pub(crate) fn count_derived(&mut self, statements: usize) {
+        let derived = Source::new(SourceKind::Derived, "");
+        let since_ms = self.sources.values().map(|source| source.since_ms).min();
+        let mut status = SourceStatus::new(&derived, since_ms.unwrap_or_default());
+        status.statements = statements;
+        self.sources.insert(derived, status);
+    }
+}
+
+impl SourceStatus {
+    pub(crate) fn new(source: &Source, at: u64) -> Self {
+        Self {
+            graph: source.graph(),
+            kind: source.kind,
+            name: source.name.clone(),
+            statements: 0,
+            lasting: false,
+            since_ms: at,
+        }
+    }
+}
+
+/// Reads the statements of a document. Names of blank nodes are made new.
+fn parsed(format: RdfFormat, document: &[u8]) -> Result<HashSet<Triple>, KnowledgeFault> {
+    let mut triples = HashSet::new();
+    for quad in RdfParser::from_format(format)
+        .without_named_graphs()
+        .rename_blank_nodes()
+        .for_slice(document)
+    {
+        let quad = quad.map_err(|error| KnowledgeFault::Turtle(described(&error)))?;
+        triples.insert(Triple::from(quad));
+        if triples.len() > MAX_STATEMENTS {
+            return Err(KnowledgeFault::TooMany {
+                most: MAX_STATEMENTS,
+            });
+        }
+    }
+    Ok(triples)
+}
+
+/// Describes a syntax error with its line.
+fn described(error: &RdfSyntaxError) -> String {
+    match error.location() {
+        Some(location) => format!("line {}: {error}", location.start.line + 1),
+        None => error.to_string(),
     }
 }
 
 impl fmt::Debug for Knowledge {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Knowledge")
-            .field("sources", &self.sources)
+            .field("written", &self.written)
             .finish_non_exhaustive()
     }
-}
-
-/// Returns the statements to add to a graph and to remove from it.
-fn difference(
-    transaction: &Transaction<'_>,
-    graph: &NamedNode,
-    wanted: &HashSet<Triple>,
-) -> Result<(Vec<Triple>, Vec<Triple>), StorageError> {
-    let present = transaction
-        .quads_for_pattern(None, None, None, Some(graph.into()))
-        .map(|quad| quad.map(Triple::from))
-        .collect::<Result<HashSet<_>, _>>()?;
-    let added = wanted.difference(&present).cloned().collect();
-    let removed = present.difference(wanted).cloned().collect();
-    Ok((added, removed))
-}
-
-fn apply(
-    transaction: &mut Transaction<'_>,
-    graph: &NamedNode,
-    added: &[Triple],
-    removed: &[Triple],
-) -> Result<(), StorageError> {
-    // The store keeps literals in their canonical form: `.120Z` is added again while `.12Z` is
-    // removed. Statements are therefore removed before others are added.
-    for triple in removed {
-        transaction.remove(triple.as_ref().in_graph(graph));
-    }
-    for triple in removed {
-        let (subject, predicate, object) = (
-            triple.subject.as_ref(),
-            triple.predicate.as_ref(),
-            triple.object.as_ref(),
-        );
-        let mut said =
-            transaction.quads_for_pattern(Some(subject), Some(predicate), Some(object), None);
-        let elsewhere = said.find(|quad| {
-            quad.as_ref()
-                .map_or(true, |quad| !quad.graph_name.is_default_graph())
-        });
-        let is_said = elsewhere.transpose()?.is_some();
-        drop(said);
-        if !is_said {
-            transaction.remove(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
-        }
-    }
-    for triple in added {
-        transaction.insert(triple.as_ref().in_graph(graph));
-        transaction.insert(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
-    }
-    // A graph without statements does not exist.
-    let is_empty = transaction
-        .quads_for_pattern(None, None, None, Some(graph.into()))
-        .next()
-        .is_none();
-    if is_empty {
-        transaction.remove_named_graph(graph)?;
-    }
-    Ok(())
-}
-
-/// Applies the rule for subclasses: transitive through any number of classes, and reflexive.
-/// Questions never need a path (`rdfs:subClassOf*`), which the evaluator would follow last and for
-/// all classes.
-fn closure(
-    transaction: &Transaction<'_>,
-    sub_class: NamedNodeRef<'_>,
-    derived: &NamedNode,
-) -> Result<HashSet<Triple>, StorageError> {
-    let mut above: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
-    for quad in transaction.quads_for_pattern(None, Some(sub_class), None, None) {
-        let quad = quad?;
-        let is_direct = matches!(&quad.graph_name, GraphName::NamedNode(graph) if graph != derived);
-        if let (NamedOrBlankNode::NamedNode(class), Term::NamedNode(supertype), true) =
-            (quad.subject, quad.object, is_direct)
-        {
-            above.entry(supertype.as_str().to_owned()).or_default();
-            above
-                .entry(class.into_string())
-                .or_default()
-                .insert(supertype.into_string());
-        }
-    }
-    let mut all = HashSet::new();
-    for class in above.keys() {
-        let mut seen: BTreeSet<&str> = BTreeSet::from([class.as_str()]);
-        let mut waiting = vec![class.as_str()];
-        while let Some(next) = waiting.pop() {
-            let further = above.get(next).into_iter().flatten();
-            waiting.extend(
-                further
-                    .map(String::as_str)
-                    .filter(|further| seen.insert(further)),
-            );
-        }
-        if all.len() + seen.len() > MAX_DERIVED {
-            tracing::warn!(
-                most = MAX_DERIVED,
-                "the classes have more superclasses than are kept; questions about types miss some"
-            );
-            break;
-        }
-        let class = NamedNode::new_unchecked(class);
-        let above = seen.into_iter().map(NamedNode::new_unchecked);
-        all.extend(above.map(|above| Triple::new(class.clone(), sub_class, above)));
-    }
-    Ok(all)
 }
 
 fn triple(statement: &Statement) -> Result<Triple, KnowledgeFault> {
@@ -411,7 +462,7 @@ fn triple(statement: &Statement) -> Result<Triple, KnowledgeFault> {
     ))
 }
 
-fn named(iri: &str) -> Result<NamedNode, KnowledgeFault> {
+pub(crate) fn named(iri: &str) -> Result<NamedNode, KnowledgeFault> {
     let text: String = iri.chars().take(200).collect();
     NamedNode::new(iri).map_err(|error| KnowledgeFault::Iri {
         text,
@@ -419,10 +470,10 @@ fn named(iri: &str) -> Result<NamedNode, KnowledgeFault> {
     })
 }
 
-/// The base NodeSet, the largest published NodeSet, results in some 40 000.
-const MAX_STATEMENTS: usize = 200_000;
-const MAX_SOURCES: usize = 2000;
-const MAX_DERIVED: usize = 500_000;
+/// The base NodeSet, the largest published NodeSet, results in some 40 000; a graph of a user may
+/// be larger.
+pub(crate) const MAX_STATEMENTS: usize = 2_000_000;
+pub(crate) const MAX_SOURCES: usize = 2000;
 
 #[cfg(test)]
 mod tests {

@@ -4,3 +4,4 @@ mod http;
 mod memory;
 mod store;
 mod vocabulary;
+mod writes;

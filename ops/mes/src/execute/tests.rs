@@ -4,7 +4,7 @@ use knowledge::{Knowledge, Source, SourceKind};
 use skills::TypeName;
 
 use super::*;
-use crate::process::{Need, Step};
+use crate::process::{Given, Need, Step};
 
 /// A plant for tests. Its skills do nothing and record their runs.
 struct Fakes {
@@ -62,18 +62,12 @@ impl Plant for Arc<Fakes> {
         )))
     }
 
-    fn values(
-        &self,
-        _skill: &str,
-        given: &[(String, serde_json::Value)],
-    ) -> Result<Vec<(String, Value)>, String> {
+    fn values(&self, _skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
         given
             .iter()
-            .map(|(name, value)| {
-                Ok((
-                    name.clone(),
-                    Value::Double(value.as_f64().ok_or("no number")?),
-                ))
+            .map(|given| {
+                let number = given.value.as_f64().ok_or("no number")?;
+                Ok((given.name.clone(), Value::Double(number)))
             })
             .collect()
     }
@@ -262,6 +256,7 @@ fn process() -> Process {
     let step = |name: &str, last| Step {
         name: name.into(),
         needs: [Role::Ptp, Role::Linear, last].map(need).into(),
+        ..Step::default()
     };
     Process {
         iri: "urn:example:process:move-part".into(),
@@ -473,13 +468,18 @@ async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
             capability: None,
             skill_type: Some(TypeName::own(of)),
         }],
+        ..Step::default()
     };
-    let given = vec![("Force".to_owned(), serde_json::json!(12))];
-    let process = Process {
+    let mut process = Process {
         steps: vec![alone(0, "GraspSkillType"), alone(1, "ReleaseSkillType")],
-        work: Job::Sequence(vec![given, vec![]]),
+        work: Job::Sequence,
         ..process()
     };
+    process.steps[0].parameters.push(Given {
+        name: "Force".into(),
+        value: 12.into(),
+        unit: None,
+    });
     let (run, fakes, _) = executed(plant(gripper("gripper")), &process).await;
     assert_eq!(run.outcome, How::Done, "{run:?}");
     assert_eq!(

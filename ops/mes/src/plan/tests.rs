@@ -3,7 +3,7 @@ use std::time::Duration;
 use skills::TypeName;
 
 use super::*;
-use crate::process::{Job, Step};
+use crate::process::{Given, Job, Step};
 
 const GRASP: &str = "urn:example:capability:grasp";
 const RELEASE: &str = "urn:example:capability:release";
@@ -17,12 +17,17 @@ fn need(role: Role, capability: &str) -> Need {
     }
 }
 
+fn plan(process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Plan {
+    super::plan(process, offers, fallen, &|_, _| Ok(()))
+}
+
 /// A process that picks a part and places it.
 fn process() -> Process {
     let moves = || [need(Role::Ptp, MOVE), need(Role::Linear, MOVE)];
     let step = |name: &str, last| Step {
         name: name.into(),
         needs: moves().into_iter().chain([last]).collect(),
+        ..Step::default()
     };
     Process {
         iri: "urn:example:process:move-part".into(),
@@ -265,31 +270,157 @@ fn nothing_there_is_told_as_that() {
     assert!(empty.missing().starts_with("pick needs urn:example:capability:move by a skill of nsu=urn:ua-bridge:skills;PtpMoveSkillType for ptp (there is none)"), "{}", empty.missing());
 }
 
-#[test]
-fn steps_without_a_composite_may_be_done_by_different_components() {
-    let alone = |step: usize, capability: &str| Step {
-        name: format!("step {step}"),
+fn sequence(capabilities: &[&str]) -> Process {
+    let steps = capabilities.iter().enumerate();
+    let alone = |(number, capability): (usize, &&str)| Step {
+        name: format!("step {number}"),
         needs: vec![Need {
-            role: Role::Alone(step),
-            capability: Some(capability.into()),
+            role: Role::Alone(number),
+            capability: Some((*capability).into()),
             skill_type: None,
         }],
+        ..Step::default()
     };
-    let process = Process {
-        steps: vec![alone(0, GRASP), alone(1, MOVE)],
-        work: Job::Sequence(vec![vec![], vec![]]),
+    Process {
+        steps: steps.map(alone).collect(),
+        work: Job::Sequence,
         ..process()
-    };
-    let plan = plan(
-        &process,
-        &[robot("robot"), gripper("gripper")].concat(),
-        &[],
+    }
+}
+
+fn chosen(plan: &Plan, steps: usize) -> Vec<&str> {
+    let chosen = |number| plan.chosen(Role::Alone(number)).unwrap_or("none");
+    (0..steps)
+        .map(|number| chosen(number).trim_start_matches("urn:example:"))
+        .collect()
+}
+
+#[test]
+fn steps_without_a_composite_may_be_done_by_different_components() {
+    let offers = [robot("robot"), gripper("gripper")].concat();
+    let plan = plan(&sequence(&[GRASP, MOVE]), &offers, &[]);
+    assert_eq!(chosen(&plan, 2), ["gripper#Grasp", "robot#Lin"]);
+}
+
+/// A gripper whose grasp has a capability of its own below the capability of all grippers.
+fn vacuum(name: &str) -> Vec<Offer> {
+    let mut vacuum = gripper(name);
+    vacuum[0].capabilities = vec![SUCK.into()];
+    vacuum[0].closure = vec![SUCK.into(), GRASP.into()];
+    vacuum
+}
+
+const SUCK: &str = "urn:example:capability:suck";
+
+#[test]
+fn the_component_that_grasped_releases() {
+    // Both grippers can release, and the finger gripper comes first by its name.
+    let offers = [gripper("finger"), robot("robot"), vacuum("vacuum")].concat();
+    let by_vacuum = plan(&sequence(&[SUCK, MOVE, RELEASE]), &offers, &[]);
+    let expected = ["vacuum#Grasp", "robot#Lin", "vacuum#Release"];
+    assert_eq!(chosen(&by_vacuum, 3), expected);
+    // Two parts in two grippers are released in the reverse order.
+    let two = plan(&sequence(&[SUCK, GRASP, RELEASE, RELEASE]), &offers, &[]);
+    let expected = [
+        "vacuum#Grasp",
+        "finger#Grasp",
+        "finger#Release",
+        "vacuum#Release",
+    ];
+    assert_eq!(chosen(&two, 4), expected);
+    // A gripper that cannot release does not grasp.
+    let only_grasps = vacuum("vacuum").into_iter().take(1).collect();
+    let offers = [gripper("finger"), only_grasps].concat();
+    let none = plan(&sequence(&[SUCK, RELEASE]), &offers, &[]);
+    assert!(!none.is_complete());
+    let expected = "its component has nothing for the step `step 1`";
+    assert!(none.missing().contains(expected), "{}", none.missing());
+}
+
+#[test]
+fn a_step_is_done_by_the_component_of_another_step_if_the_process_says_so() {
+    let offers = [gripper("finger"), vacuum("vacuum")].concat();
+    let mut process = sequence(&[SUCK, GRASP, RELEASE, RELEASE]);
+    process.steps[2].by = By::SameAs(0);
+    let expected = [
+        "vacuum#Grasp",
+        "finger#Grasp",
+        "vacuum#Release",
+        "finger#Release",
+    ];
+    assert_eq!(chosen(&plan(&process, &offers, &[]), 4), expected);
+}
+
+#[test]
+fn the_attached_tool_does_what_it_can() {
+    let change = offer(
+        "changer",
+        "Change",
+        &["ChangeToolSkillType"],
+        &["urn:change"],
     );
+    let offers = [
+        vec![change],
+        gripper("finger"),
+        robot("robot"),
+        gripper("vacuum"),
+    ]
+    .concat();
+    let mut process = sequence(&["urn:change", GRASP, MOVE, RELEASE]);
+    process.steps[0].parameters = vec![Given {
+        name: "ToolAppUri".into(),
+        value: "urn:example:vacuum".into(),
+        unit: None,
+    }];
+    let attached = plan(&process, &offers, &[]);
+    let expected = [
+        "changer#Change",
+        "vacuum#Grasp",
+        "robot#Lin",
+        "vacuum#Release",
+    ];
+    assert_eq!(chosen(&attached, 4), expected);
     assert_eq!(
-        (plan.chosen(Role::Alone(0)), plan.chosen(Role::Alone(1))),
-        (
-            Some("urn:example:gripper#Grasp"),
-            Some("urn:example:robot#Lin")
-        )
+        why(&attached, Role::Alone(1), "finger#Grasp"),
+        "it is not of the tool urn:example:vacuum, which the step `step 0` attaches"
     );
+    // A tool that is not there is waited for, if the process says that it does the step.
+    process.steps[0].parameters[0].value = "urn:example:absent".into();
+    process.steps[1].by = By::AttachedTool;
+    assert!(!plan(&process, &offers, &[]).is_complete());
+    process.steps.remove(0);
+    process
+        .steps
+        .iter_mut()
+        .zip(0..)
+        .for_each(|(step, number)| {
+            step.needs[0].role = Role::Alone(number);
+        });
+    let without = plan(&process, &offers, &[]);
+    let expected = "no step before it attaches a tool";
+    assert!(
+        without.missing().contains(expected),
+        "{}",
+        without.missing()
+    );
+}
+
+#[test]
+fn a_skill_that_cannot_take_the_parameters_of_a_step_is_not_chosen() {
+    let offers = [gripper("finger"), gripper("vacuum")].concat();
+    let process = sequence(&[GRASP, RELEASE]);
+    let check = |offer: &Offer, step: &Step| {
+        let is_refused = offer.component_name == "finger" && step.name == "step 1";
+        if is_refused {
+            Err("Release has no parameter Nonsense".to_owned())
+        } else {
+            Ok(())
+        }
+    };
+    let two = super::plan(&process, &offers, &[], &check);
+    assert_eq!(chosen(&two, 2), ["vacuum#Grasp", "vacuum#Release"]);
+    let one = super::plan(&process, &offers[..2], &[], &check);
+    assert!(!one.is_complete());
+    let expected = "finger.Release: Release has no parameter Nonsense";
+    assert!(one.missing().contains(expected), "{}", one.missing());
 }

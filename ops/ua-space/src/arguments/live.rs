@@ -227,6 +227,76 @@ pub(crate) struct Ask {
     pub(crate) json: bool,
 }
 
+#[derive(Debug, Args)]
+pub(crate) struct Source {
+    #[command(subcommand)]
+    pub(crate) verb: SourceVerb,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum SourceVerb {
+    /// List the sources with their findings
+    List {
+        /// Print the response unchanged
+        #[arg(long)]
+        json: bool,
+        #[command(flatten)]
+        at: SourceAt,
+    },
+    /// Add or replace a source
+    Add {
+        /// A NodeSet, a manifest (.aml, .mtp, .amlx), or Turtle (.ttl); - for stdin
+        #[arg(value_name = "FILE")]
+        file: String,
+        /// file (Turtle), nodeset, mtp or process (Turtle); found by the name and contents of the
+        /// file
+        #[arg(long, value_name = "KIND")]
+        kind: Option<String>,
+        /// The name of the source; the name of the file unless given. A NodeSet is named by its
+        /// namespace
+        #[arg(long = "as", value_name = "NAME")]
+        name: Option<String>,
+        #[command(flatten)]
+        at: SourceAt,
+    },
+    /// Remove a source
+    Remove {
+        /// file, nodeset, mtp or process
+        #[arg(value_name = "KIND")]
+        kind: String,
+        /// The name of the source, as `ua-space source list` shows it
+        #[arg(value_name = "NAME")]
+        name: String,
+        #[command(flatten)]
+        at: SourceAt,
+    },
+    /// Run an update of SPARQL 1.1 on the graphs of users
+    Update {
+        /// The file of the update, or - for stdin
+        #[arg(value_name = "FILE")]
+        file: String,
+        #[command(flatten)]
+        at: SourceAt,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SourceAt {
+    /// The URL of ua-mes
+    #[arg(
+        long,
+        value_name = "URL",
+        env = "UA_SPARQL",
+        default_value = "http://127.0.0.1:8087"
+    )]
+    pub(crate) url: String,
+    /// The user, where ua-mes has users; the password is in UA_PASSWORD
+    #[arg(long, value_name = "NAME", env = "UA_USER")]
+    pub(crate) user: Option<String>,
+    #[arg(long, hide = true, env = "UA_PASSWORD", hide_env_values = true)]
+    pub(crate) password: Option<String>,
+}
+
 /// The target of a call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Target {

@@ -251,14 +251,13 @@ impl Access {
             endpoint: endpoint.to_owned(),
             fault: None,
         };
-        self.log_in(&mut login, name, &Password::new(password))
-            .await;
+        self.log_in(&mut login, name, &password).await;
         self.tell(&login);
         login.fault.is_none()
     }
 
     /// Checks a password and notes a fault.
-    async fn log_in(&self, login: &mut Login, name: &str, password: &Password) {
+    async fn log_in(&self, login: &mut Login, name: &str, password: &str) {
         if !self.check(name, password).await {
             login.fault = Some(LoginFault::Password);
             // Delays repeated attempts; a connection has a single attempt at a time.
@@ -276,6 +275,22 @@ impl Access {
         users
             .get(&caller.user)
             .map_or(Roles::NONE, |user| user.roles)
+    }
+
+    /// Returns the roles of anonymous clients.
+    #[must_use]
+    pub fn roles_of_anonymous(&self) -> Roles {
+        self.anonymous().unwrap_or(Roles::NONE)
+    }
+
+    /// Returns the roles of a user with a password; none if the password is wrong, see
+    /// [`sign_in`](Self::sign_in).
+    pub async fn roles_by_password(&self, name: &str, password: &str, endpoint: &str) -> Roles {
+        if self.sign_in(name, password.to_owned(), endpoint).await {
+            self.roles_of_user(name).unwrap_or(Roles::NONE)
+        } else {
+            Roles::NONE
+        }
     }
 
     /// Returns whether a user has a right on a node at the moment. Nodes of the core namespace are
@@ -329,12 +344,12 @@ impl Access {
     }
 
     /// Checks the password of a user. The check takes the same time if the user does not exist.
-    async fn check(&self, name: &str, password: &Password) -> bool {
+    async fn check(&self, name: &str, password: &str) -> bool {
         let hash = match self.users.read().get(name).map(|user| &user.credential) {
             Some(Credential::Password(hash)) => Some(hash.clone()),
             Some(Credential::Certificate(_)) | None => None,
         };
-        let password = password.get().as_bytes().to_vec();
+        let password = password.as_bytes().to_vec();
         if password.len() > LARGEST_PASSWORD {
             return false;
         }
@@ -389,7 +404,7 @@ impl AuthManager for Access {
     ) -> Result<UserToken, Error> {
         let told: String = username.chars().take(64).collect();
         let mut login = login("password", &told, endpoint);
-        self.log_in(&mut login, username, password).await;
+        self.log_in(&mut login, username, password.get()).await;
         self.answered(&login, UserToken(username.to_owned()))
     }
 
@@ -583,11 +598,9 @@ mod tests {
         users.put("anna", user).unwrap();
         users.write(&folder).unwrap();
         let access = Access::new(Some(folder.clone()), true).unwrap();
-        let right = Password::new("correct horse".to_owned());
-        let wrong = Password::new("correct house".to_owned());
-        assert!(access.check("anna", &right).await);
-        assert!(!access.check("anna", &wrong).await);
-        assert!(!access.check("bert", &right).await);
+        assert!(access.check("anna", "correct horse").await);
+        assert!(!access.check("anna", "correct house").await);
+        assert!(!access.check("bert", "correct horse").await);
         assert!(
             access
                 .sign_in("anna", "correct horse".to_owned(), "page")
@@ -606,6 +619,10 @@ mod tests {
             (access.roles_of_user("bert"), access.has_users()),
             (None, true)
         );
+        let roles = access.roles_by_password("anna", "correct horse", "SPARQL").await;
+        assert_eq!(roles, Roles::of(&[Role::Operator]));
+        let none = access.roles_by_password("anna", "correct house", "SPARQL").await;
+        assert_eq!(none, Roles::NONE);
         std::fs::remove_dir_all(folder).unwrap();
     }
 }

@@ -6,7 +6,7 @@ use futures_util::{StreamExt, TryStreamExt, stream};
 use plant_opcua::client::{Browse, Client};
 use plant_opcua::types::{
     AttributeId, EUInformation, NodeClass, NodeClassMask, NodeId, ObjectId, ObjectTypeId,
-    QualifiedName, ReferenceDescription, Variant,
+    QualifiedName, Range, ReferenceDescription, Variant,
 };
 
 use super::choice::ToolState;
@@ -75,6 +75,8 @@ pub struct FoundParameter {
     pub default: Option<Value>,
     /// Its unit, by the symbol.
     pub unit: Option<String>,
+    /// The lowest and the highest value of a number.
+    pub range: Option<(f64, f64)>,
     /// Its node, as `nsu=<namespace uri>;i=1000017`.
     pub node: String,
     pub(super) id: NodeId,
@@ -531,6 +533,7 @@ async fn group(
             shape,
             default: None,
             unit: unit(client, &id).await?,
+            range: range(client, &id).await?,
             node: text_of(client, &id),
             id,
             packed,
@@ -542,10 +545,22 @@ async fn group(
 }
 
 async fn unit(client: &Client, node: &NodeId) -> Result<Option<String>, SkillFault> {
-    let Ok(node) = client
-        .translate(node, &[QualifiedName::new(0, "EngineeringUnits")])
-        .await
-    else {
+    let unit = property::<EUInformation>(client, node, "EngineeringUnits").await?;
+    Ok(unit.map(|unit| unit.display_name.text.as_ref().to_owned()))
+}
+
+async fn range(client: &Client, node: &NodeId) -> Result<Option<(f64, f64)>, SkillFault> {
+    let range = property::<Range>(client, node, "EURange").await?;
+    Ok(range.map(|range| (range.low, range.high)))
+}
+
+/// Returns the structure of a property; `None` if there is no such property.
+async fn property<T: Clone + Send + Sync + 'static>(
+    client: &Client,
+    node: &NodeId,
+    name: &str,
+) -> Result<Option<T>, SkillFault> {
+    let Ok(node) = client.translate(node, &[QualifiedName::new(0, name)]).await else {
         return Ok(None);
     };
     let read = client.read(&[node]).await.map_err(|error| lost(&error))?;
@@ -553,9 +568,7 @@ async fn unit(client: &Client, node: &NodeId) -> Result<Option<String>, SkillFau
     let Some(Variant::ExtensionObject(object)) = value else {
         return Ok(None);
     };
-    Ok(object
-        .inner_as::<EUInformation>()
-        .map(|unit| unit.display_name.text.as_ref().to_owned()))
+    Ok(object.inner_as::<T>().cloned())
 }
 
 async fn value(client: &Client, node: &NodeId) -> Result<Option<Value>, SkillFault> {

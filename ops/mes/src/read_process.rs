@@ -1,0 +1,387 @@
+//! Reads processes from the graph, which decides which processes run.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use knowledge::{Answer, Knowledge};
+use serde_json::Value;
+use skills::TypeName;
+
+use crate::process::{By, Given, Job, Need, Process, Role, Step};
+
+/// The processes of the graph: each can run, or has a reason why it cannot.
+#[derive(Debug, Default)]
+pub(crate) struct Processes {
+    pub(crate) all: Vec<Process>,
+    /// The reasons by the IRI of the process.
+    pub(crate) faults: BTreeMap<String, String>,
+}
+
+type Row = BTreeMap<String, Value>;
+
+impl Processes {
+    /// Reads all processes.
+    pub(crate) fn read(knowledge: &Knowledge) -> Result<Self, String> {
+        let ask = |question| {
+            let answer = knowledge.ask(question, &[]);
+            answer.map_err(|fault| fault.to_string())
+        };
+        let (steps, parameters) = (ask("process-steps")?, ask("process-parameters")?);
+        let mut by_process: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
+        for row in &steps.rows {
+            let process = Answer::text(row, "process");
+            by_process.entry(process).or_default().push(row);
+        }
+        let mut processes = Self::default();
+        for (iri, rows) in by_process {
+            match process(iri, &rows, &parameters.rows) {
+                Ok(process) => processes.all.push(process),
+                Err(why) => drop(processes.faults.insert(iri.to_owned(), why)),
+            }
+        }
+        Ok(processes)
+    }
+}
+
+fn process(iri: &str, rows: &[&Row], parameters: &[Row]) -> Result<Process, String> {
+    let within = seconds(one(rows, "within")?, "ua:within")?.unwrap_or(USUALLY_WITHIN);
+    let wait = seconds(one(rows, "wait")?, "ua:wait")?.unwrap_or(USUALLY_WAIT);
+    let name = one(rows, "name")?.and_then(Value::as_str);
+    let mut by_part: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
+    for row in rows
+        .iter()
+        .filter(|row| !Answer::text(row, "part").is_empty())
+    {
+        let part = Answer::text(row, "part");
+        by_part.entry(part).or_default().push(row);
+    }
+    if by_part.is_empty() {
+        return Err("it has no ua:hasStep".to_owned());
+    }
+    if by_part.len() > MOST_STEPS {
+        return Err(format!("it has more than {MOST_STEPS} steps"));
+    }
+    let mut ordered: Vec<(i64, &str, Vec<&Row>)> = Vec::new();
+    for (part, rows) in by_part {
+        let position = one(&rows, "position")?.and_then(Value::as_i64);
+        let position =
+            position.ok_or_else(|| format!("the step {part} has no number as its ua:position"))?;
+        ordered.push((position, part, rows));
+    }
+    ordered.sort_by_key(|(position, ..)| *position);
+    if let Some([(position, one, _), (_, other, _)]) = ordered
+        .windows(2)
+        .find_map(|pair| <&[_; 2]>::try_from(pair).ok().filter(|[a, b]| a.0 == b.0))
+    {
+        return Err(format!(
+            "the steps {one} and {other} have the ua:position {position}"
+        ));
+    }
+    let job = job(rows)?;
+    let order: Vec<&str> = ordered.iter().map(|(_, part, _)| *part).collect();
+    let mut steps = Vec::new();
+    for (number, (_, part, rows)) in ordered.iter().enumerate() {
+        let role = job.is_none().then_some(Role::Alone(number));
+        let step = step(part, rows, role, (&order, number), parameters);
+        steps.push(step.map_err(|why| format!("the step {part} {why}"))?);
+    }
+    if job.is_some() {
+        let has = |role: &Role| {
+            let mut needs = steps.iter().flat_map(|step: &Step| &step.needs);
+            needs.any(|need| need.role == *role)
+        };
+        if let Some(role) = Role::OF_COMPOSITE.iter().find(|role| !has(role)) {
+            return Err(format!(
+                "no step has a need with the ua:role `{}`",
+                role.name()
+            ));
+        }
+    }
+    Ok(Process {
+        iri: iri.to_owned(),
+        name: name.unwrap_or(iri).to_owned(),
+        work: job.map_or(Job::Sequence, Job::PickAndPlace),
+        steps,
+        within,
+        wait,
+    })
+}
+
+fn job(rows: &[&Row]) -> Result<Option<skills::Job>, String> {
+    let position = |column: &str| {
+        let Some(value) = one(rows, column)? else {
+            return Ok(None);
+        };
+        let text = value.as_str().unwrap_or_default();
+        let numbers = text
+            .split_ascii_whitespace()
+            .map(|number| number.parse().ok());
+        let numbers: Option<Vec<f64>> = numbers.collect();
+        let position = numbers.and_then(|numbers| numbers.try_into().ok());
+        position
+            .map(Some)
+            .ok_or_else(|| format!("its ua:{column} is not six numbers: m, m, m, rad, rad, rad"))
+    };
+    let (Some(pick), Some(place)) = (position("pick")?, position("place")?) else {
+        return Ok(None);
+    };
+    let approach = one(rows, "approach")?.and_then(Value::as_f64);
+    Ok(Some(skills::Job {
+        pick,
+        place,
+        approach: approach.unwrap_or(USUALLY_APPROACH),
+    }))
+}
+
+fn step(
+    part: &str,
+    rows: &[&Row],
+    role: Option<Role>,
+    (order, number): (&[&str], usize),
+    parameters: &[Row],
+) -> Result<Step, String> {
+    let name = one(rows, "step")?.and_then(Value::as_str).unwrap_or(part);
+    let with = one(rows, "with")?.and_then(Value::as_str);
+    let is_attached = one(rows, "attached")?.and_then(Value::as_bool) == Some(true);
+    let by = match with {
+        Some(_) if is_attached => {
+            return Err("has ua:byComponentOf and ua:byAttachedTool; give one".to_owned());
+        }
+        Some(with) => {
+            let other = order.iter().position(|known| *known == with);
+            let other = other.filter(|other| *other < number);
+            By::SameAs(other.ok_or_else(|| format!("names {with}, which is no earlier step"))?)
+        }
+        None if is_attached => By::AttachedTool,
+        None => By::Any,
+    };
+    let mut by_need: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
+    for row in rows
+        .iter()
+        .filter(|row| !Answer::text(row, "need").is_empty())
+    {
+        let need = Answer::text(row, "need");
+        by_need.entry(need).or_default().push(row);
+    }
+    if by_need.is_empty() {
+        return Err("has no css:requiresCapability".to_owned());
+    }
+    if role.is_some() && by_need.len() > 1 {
+        return Err("needs several skills, and a step of a sequence is one skill".to_owned());
+    }
+    let needs = by_need.values().map(|rows| need(rows, role));
+    let needs = needs.collect::<Result<_, _>>()?;
+    let mut given: Vec<Given> = Vec::new();
+    for row in parameters
+        .iter()
+        .filter(|row| Answer::text(row, "part") == part)
+    {
+        let parameter = given_by(row)?;
+        if given.iter().any(|known| known.name == parameter.name) {
+            return Err(format!("gives the parameter {} twice", parameter.name));
+        }
+        given.push(parameter);
+    }
+    Ok(Step {
+        name: name.to_owned(),
+        needs,
+        parameters: given,
+        by,
+    })
+}
+
+fn need(rows: &[&Row], role: Option<Role>) -> Result<Need, String> {
+    let role = match (role, one(rows, "role")?.and_then(Value::as_str)) {
+        (Some(role), _) => role,
+        (None, named) => {
+            let known = Role::OF_COMPOSITE.into_iter();
+            let mut known = known.filter(|role| Some(role.name()) == named);
+            let names = "ptp, linear, grasp or release";
+            known
+                .next()
+                .ok_or_else(|| format!("has a need whose ua:role is not {names}"))?
+        }
+    };
+    let capability = one(rows, "capability")?.and_then(Value::as_str);
+    let skill_type = match one(rows, "type")? {
+        None => role.skill_type(),
+        Some(of) => {
+            let name = one(rows, "type_name")?.and_then(Value::as_str);
+            let namespace = one(rows, "type_namespace")?.and_then(Value::as_str);
+            match (name, namespace) {
+                (Some(name), Some(namespace)) => Some(TypeName {
+                    namespace: namespace.to_owned(),
+                    name: name.to_owned(),
+                }),
+                _ => {
+                    return Err(format!(
+                        "needs the type {of}, which no NodeSet here describes"
+                    ));
+                }
+            }
+        }
+    };
+    if capability.is_none() && skill_type.is_none() {
+        return Err("has a need without a capability or type".to_owned());
+    }
+    Ok(Need {
+        role,
+        capability: capability.map(str::to_owned),
+        skill_type,
+    })
+}
+
+fn given_by(row: &Row) -> Result<Given, String> {
+    let name = Answer::text(row, "name");
+    if name.is_empty() {
+        return Err("has a parameter without cask:hasVariableName".to_owned());
+    }
+    let is_there = |column: &str| row.get(column).filter(|value| !value.is_null());
+    let value = match (is_there("value"), is_there("json")) {
+        (Some(value), None) => value.clone(),
+        (None, Some(json)) => serde_json::from_str(json.as_str().unwrap_or_default())
+            .map_err(|error| format!("has a ua:valueJson of {name} that is no JSON: {error}"))?,
+        _ => return Err(format!("has no value, or several, for {name}")),
+    };
+    let unit = is_there("unit").and_then(Value::as_str);
+    Ok(Given {
+        name: name.to_owned(),
+        value,
+        unit: unit.map(str::to_owned),
+    })
+}
+
+/// Returns the value of a column, which must be the same in all rows that have it.
+fn one<'a>(rows: &[&'a Row], column: &str) -> Result<Option<&'a Value>, String> {
+    let values = rows.iter().filter_map(|row| row.get(column));
+    let mut values = values.filter(|value| !value.is_null());
+    let Some(first) = values.next() else {
+        return Ok(None);
+    };
+    match values.find(|value| *value != first) {
+        None => Ok(Some(first)),
+        Some(other) => Err(format!("has two values of {column}: {first} and {other}")),
+    }
+}
+
+fn seconds(value: Option<&Value>, name: &str) -> Result<Option<Duration>, String> {
+    let Some(value) = value else {
+        return Ok(None);
+    };
+    let seconds = value.as_f64().filter(|seconds| *seconds <= LONGEST);
+    let time = seconds.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    time.map(Some)
+        .ok_or_else(|| format!("its {name} is not a number of seconds: {value}"))
+}
+
+const USUALLY_WITHIN: Duration = Duration::from_secs(30);
+const USUALLY_WAIT: Duration = Duration::from_secs(60);
+const USUALLY_APPROACH: f64 = 0.05;
+const MOST_STEPS: usize = 100;
+/// Longest time of a process in seconds.
+const LONGEST: f64 = 7.0 * 86_400.0;
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use knowledge::{Source, SourceKind};
+
+    use super::*;
+    use crate::settings::Settings;
+
+    fn read(turtle: &str) -> Processes {
+        let knowledge = Knowledge::new().unwrap();
+        let source = Source::new(SourceKind::File, "processes.ttl");
+        knowledge.replace_turtle(&source, turtle, 1).unwrap();
+        Processes::read(&knowledge).unwrap()
+    }
+
+    const TURTLE: &str = "@prefix css: <http://www.w3id.org/hsu-aut/css#> . @prefix cask: <http://www.w3id.org/hsu-aut/cask#> .
+        @prefix ua: <urn:ua-bridge:plant#> . @prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> .
+        <urn:p> a css:Process ; rdfs:label \"hold\" ; ua:within 20 ; ua:hasStep <urn:p/1> , <urn:p/2> .
+        <urn:p/2> rdfs:label \"let go\" ; ua:position 2 ; ua:byComponentOf <urn:p/1> ;
+            css:requiresCapability [ a cask:RequiredCapability , <urn:c:release> ] .
+        <urn:p/1> rdfs:label \"grip\" ; ua:position 1 ; css:requiresCapability [ a cask:RequiredCapability , <urn:c:grasp> ] ;
+            ua:hasParameter [ cask:hasVariableName \"Force\" ; ua:value 12.5 ; ua:unit \"N\" ] .";
+
+    #[test]
+    fn a_process_of_a_file_is_read_in_its_order() {
+        let processes = read(TURTLE);
+        assert_eq!(processes.faults, BTreeMap::new());
+        let [process] = processes.all.as_slice() else {
+            panic!("{processes:?}")
+        };
+        let names: Vec<_> = process
+            .steps
+            .iter()
+            .map(|step| step.name.as_str())
+            .collect();
+        assert_eq!(names, ["grip", "let go"]);
+        assert_eq!(process.within, Duration::from_secs(20));
+        assert_eq!(process.steps[1].by, By::SameAs(0));
+        let force = Given {
+            name: "Force".into(),
+            value: serde_json::json!(12.5),
+            unit: Some("N".into()),
+        };
+        assert_eq!(process.steps[0].parameters, [force]);
+        assert_eq!(
+            process.steps[0].needs[0].capability.as_deref(),
+            Some("urn:c:grasp")
+        );
+    }
+
+    #[test]
+    fn a_process_that_cannot_run_has_a_reason() {
+        for (from, to, reason) in [
+            ("ua:position 2", "ua:position 1", "have the ua:position 1"),
+            ("ua:position 2 ;", "", "no number as its ua:position"),
+            (
+                "ua:byComponentOf <urn:p/1>",
+                "ua:byComponentOf <urn:x>",
+                "which is no earlier step",
+            ),
+            ("ua:value 12.5 ;", "", "no value, or several, for Force"),
+            (
+                "ua:within 20",
+                "ua:within \"soon\"",
+                "is not a number of seconds",
+            ),
+            (", <urn:c:release> ]", "]", "without a capability or type"),
+        ] {
+            assert!(TURTLE.contains(from), "{from}");
+            let processes = read(&TURTLE.replace(from, to));
+            assert!(processes.all.is_empty());
+            let why = &processes.faults["urn:p"];
+            assert!(why.contains(reason), "{reason}: {why}");
+        }
+    }
+
+    #[test]
+    fn processes_of_the_yaml_come_back_from_the_graph_as_they_were() {
+        let example = include_str!("../../../examples/plant/mes.yaml");
+        let own = "  - process: urn:p\n    wait: 4 s\n    steps:\n      - {step: grip, needs: {skill: urn:c:grasp}, parameters: {Force: {value: 12.5, unit: N}, Name: a, All: [1, true], Deep: -3}}\n      - {step: hold, needs: {skill: {type: GraspSkillType}}, by: attached-tool}\n      - {step: hold, needs: {skill: {type: 'nsu=urn:maker;HoldType', capability: urn:c:hold}}, by: {component_of: grip}}\n";
+        let text = format!("{example}{own}");
+        let settings = Settings::from_yaml(&text, Path::new(""))
+            .unwrap_or_else(|findings| panic!("{}", findings.render("mes.yaml", &text)));
+        let knowledge = Knowledge::new().unwrap();
+        for process in &settings.processes {
+            let source = Source::new(SourceKind::Process, &process.iri);
+            let triples = process.triples(&|_| None);
+            knowledge.replace(&source, &triples, 1).unwrap();
+        }
+        let read = Processes::read(&knowledge).unwrap();
+        assert_eq!(read.faults, BTreeMap::new());
+        let sorted = |mut all: Vec<Process>| {
+            all.sort_by(|one, other| one.iri.cmp(&other.iri));
+            for step in all.iter_mut().flat_map(|process| &mut process.steps) {
+                step.parameters
+                    .sort_by(|one, other| one.name.cmp(&other.name));
+                step.needs.sort_by_key(|need| need.role);
+            }
+            all
+        };
+        assert_eq!(sorted(read.all), sorted(settings.processes));
+    }
+}

@@ -1,0 +1,291 @@
+//! The sources of the graph: files of the YAML, and files that users add while the program runs.
+//!
+//! A source that cannot be read is a finding of the status page; all other sources are read.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use knowledge::{Knowledge, Lasting, Source, SourceFiles, SourceKind, nodeset};
+use mtp::{Module, Triple, escaped};
+use serde::Serialize;
+use tracing::{info, warn};
+
+use crate::cell::now;
+use crate::process::Process;
+use crate::settings::{self, Manifest, Settings};
+
+/// The sources, and the findings about them.
+pub(crate) struct Sources {
+    knowledge: Arc<Knowledge>,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// The sources of the YAML.
+    of_yaml: BTreeSet<Source>,
+    /// The findings by the source.
+    findings: BTreeMap<Source, Vec<Finding>>,
+}
+
+/// A fault of a source.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct Finding {
+    /// The kind and name of the source.
+    pub(crate) kind: SourceKind,
+    pub(crate) source: String,
+    /// The line in its file, from 1, if it is known.
+    pub(crate) line: Option<usize>,
+    pub(crate) what: String,
+    /// Whether the source is not in the graph because of it.
+    pub(crate) refused: bool,
+}
+
+impl Sources {
+    pub(crate) fn new(knowledge: Arc<Knowledge>) -> Self {
+        Self {
+            knowledge,
+            state: Mutex::default(),
+        }
+    }
+
+    /// Reads all files that the YAML names, and removes the sources that it named before.
+    pub(crate) fn read(&self, settings: &Settings) {
+        let mut named = BTreeSet::new();
+        let ours = skills::model::nodeset();
+        let source = Source::new(SourceKind::NodeSet, skills::model::NAMESPACE);
+        named.insert(source.clone());
+        self.try_one(source, |source| {
+            let all = node_set(&ours)?;
+            self.put(source, &all.triples, Lasting::No)
+        });
+        for file in &settings.nodesets {
+            // The graph of a NodeSet is named by its namespace, which only the file has.
+            let read = bytes(file).and_then(|bytes| node_set(&decoded(&bytes)?));
+            let name = read.as_ref().map_or(&file.name, |read| &read.namespace);
+            let source = Source::new(SourceKind::NodeSet, name);
+            named.insert(source.clone());
+            self.try_one(source, |source| {
+                self.put(source, &read?.triples, Lasting::No)
+            });
+        }
+        for file in &settings.knowledge {
+            let source = Source::new(SourceKind::File, &file.name);
+            named.insert(source.clone());
+            self.try_one(source, |source| {
+                let text = utf8(&bytes(file)?)?;
+                let read = self.knowledge.replace_turtle(source, &text, now());
+                read.map_err(|fault| fault.to_string())
+            });
+        }
+        for manifest in &settings.manifests {
+            let source = Source::new(SourceKind::Mtp, &manifest.source.name);
+            named.insert(source.clone());
+            self.try_one(source, |source| {
+                self.module(source, &bytes(&manifest.source)?, manifest, Lasting::No)
+            });
+        }
+        for process in &settings.processes {
+            let source = Source::new(SourceKind::Process, &process.iri);
+            named.insert(source.clone());
+            self.try_one(source, |source| self.process(source, process));
+        }
+        let gone: Vec<Source> = {
+            let mut state = self.state();
+            let before = std::mem::replace(&mut state.of_yaml, named);
+            before.difference(&state.of_yaml).cloned().collect()
+        };
+        for source in gone {
+            self.state().findings.remove(&source);
+            if let Err(fault) = self.knowledge.remove(&source) {
+                warn!(source = source.name, "cannot remove a source: {fault}");
+            }
+        }
+    }
+
+    /// Returns all findings.
+    pub(crate) fn findings(&self) -> Vec<Finding> {
+        self.state().findings.values().flatten().cloned().collect()
+    }
+
+    /// Adds a finding about the YAML itself, which replaces an earlier one.
+    pub(crate) fn yaml(&self, name: &str, what: Option<String>) {
+        let source = Source::new(SourceKind::File, name);
+        let found = what.map(|what| finding(&source, what, true));
+        self.state()
+            .findings
+            .insert(source, found.into_iter().collect());
+    }
+
+    /// Reads a source. Its faults become findings.
+    fn try_one(&self, source: Source, read: impl FnOnce(&Source) -> Result<(), String>) {
+        self.state().findings.remove(&source);
+        if let Err(what) = read(&source) {
+            warn!(kind = %source.kind, source = source.name, "cannot read a source: {what}");
+            let found = finding(&source, what, true);
+            self.state().findings.entry(source).or_default().push(found);
+        }
+    }
+
+    fn module(
+        &self,
+        source: &Source,
+        bytes: &[u8],
+        manifest: &Manifest,
+        lasting: Lasting,
+    ) -> Result<(), String> {
+        let module = Module::from_bytes(bytes).map_err(|fault| fault.to_string())?;
+        let triples = module.triples(&manifest.iri, &manifest.capabilities);
+        self.put(source, &triples, lasting)?;
+        for found in &module.findings {
+            let what = format!("{}: {}", found.about, found.what);
+            warn!(manifest = source.name, "{what}");
+            let found = finding(source, what, false);
+            self.state()
+                .findings
+                .entry(source.clone())
+                .or_default()
+                .push(found);
+        }
+        let (name, services) = (&module.name, module.services.len());
+        info!(
+            manifest = source.name,
+            module = name,
+            services,
+            "a module is in the graph"
+        );
+        Ok(())
+    }
+
+    fn process(&self, source: &Source, process: &Process) -> Result<(), String> {
+        let type_iri =
+            |name: &skills::TypeName| self.knowledge.type_of(&name.namespace, &name.name);
+        self.put(source, &process.triples(&type_iri), Lasting::No)
+    }
+
+    fn put(&self, source: &Source, triples: &[Triple], lasting: Lasting) -> Result<(), String> {
+        self.knowledge
+            .replace_with(source, triples, (now(), lasting))
+            .map_err(|fault| fault.to_string())
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn is_known(&self, source: &Source) -> bool {
+        let sources = self.knowledge.sources();
+        let mut sources = sources.iter();
+        sources.any(|known| known.kind == source.kind && known.name == source.name)
+    }
+
+    /// Refuses to change a source of the YAML, which would come back at the next start.
+    fn of_yaml(&self, source: &Source) -> Result<(), String> {
+        if self.state().of_yaml.contains(source) {
+            return Err(format!(
+                "the {} `{}` is named in the YAML of the MES; change the file there and send SIGHUP",
+                source.kind, source.name
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl SourceFiles for Sources {
+    fn put(&self, kind: SourceKind, name: &str, contents: &[u8]) -> Result<bool, String> {
+        let mut source = Source::new(kind, name);
+        let read = if kind == SourceKind::NodeSet {
+            let read = node_set(&decoded(contents)?)?;
+            source = Source::new(kind, &read.namespace);
+            Some(read)
+        } else {
+            None
+        };
+        self.of_yaml(&source)?;
+        let is_new = !self.is_known(&source);
+        self.state().findings.remove(&source);
+        match (kind, read) {
+            (SourceKind::NodeSet, Some(read)) => {
+                Sources::put(self, &source, &read.triples, Lasting::Yes)?;
+            }
+            (SourceKind::Mtp, _) => {
+                let manifest = Manifest {
+                    source: settings::Source {
+                        name: name.to_owned(),
+                        path: name.into(),
+                    },
+                    iri: format!("urn:ua-bridge:mtp:{}", escaped(name)),
+                    capabilities: BTreeMap::new(),
+                };
+                self.module(&source, contents, &manifest, Lasting::Yes)?;
+            }
+            (SourceKind::File | SourceKind::Process, _) => {
+                let taken = self.knowledge.take_turtle(&source, &utf8(contents)?, now());
+                taken.map_err(|fault| fault.to_string())?;
+            }
+            _ => return Err(format!("a {kind} is not read from a file")),
+        }
+        info!(kind = %kind, source = source.name, "a source was added");
+        Ok(is_new)
+    }
+
+    fn remove(&self, kind: SourceKind, name: &str) -> Result<bool, String> {
+        let source = Source::new(kind, name);
+        self.of_yaml(&source)?;
+        let removed = self.knowledge.remove(&source);
+        let removed = removed.map_err(|fault| fault.to_string())?;
+        if removed {
+            self.state().findings.remove(&source);
+            info!(kind = %kind, source = name, "a source was removed");
+        }
+        Ok(removed)
+    }
+
+    fn list(&self) -> serde_json::Value {
+        serde_json::json!({
+            "sources": self.knowledge.sources(),
+            "findings": self.findings(),
+        })
+    }
+}
+
+fn node_set(text: &str) -> Result<nodeset::NodeSet, String> {
+    nodeset::read(text).map_err(|fault| fault.to_string())
+}
+
+fn decoded(bytes: &[u8]) -> Result<std::borrow::Cow<'_, str>, String> {
+    xml_text::decode(bytes).map_err(|fault| fault.to_string())
+}
+
+fn bytes(file: &settings::Source) -> Result<Vec<u8>, String> {
+    let path = file.path.display();
+    bridge_node::read_bounded(&file.path, LARGEST)
+        .map_err(|error| format!("cannot read {path}: {error}"))
+}
+
+fn utf8(bytes: &[u8]) -> Result<String, String> {
+    let text = std::str::from_utf8(bytes).map_err(|error| {
+        let known = bytes.get(..error.valid_up_to()).unwrap_or_default();
+        let line = known.iter().filter(|byte| **byte == b'\n').count() + 1;
+        format!("line {line}: it is not UTF-8; save it as UTF-8")
+    })?;
+    Ok(text.to_owned())
+}
+
+/// Creates a finding. Its line is the number behind the first `line` of the text.
+fn finding(source: &Source, what: String, refused: bool) -> Finding {
+    let line = what.split_once("line ").and_then(|(_, rest)| {
+        let end = rest.find(|c: char| !c.is_ascii_digit());
+        rest.get(..end.unwrap_or(rest.len()))?.parse().ok()
+    });
+    Finding {
+        kind: source.kind,
+        source: source.name.clone(),
+        line,
+        what,
+        refused,
+    }
+}
+
+/// Maximum size of a file in bytes.
+const LARGEST: u64 = 64 << 20;

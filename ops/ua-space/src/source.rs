@@ -1,0 +1,213 @@
+//! `ua-space source`: lists, adds and removes the sources of the knowledge of the plant.
+
+use std::fs::File;
+use std::io::{self, Read, Write as _};
+use std::path::Path;
+
+use serde::Deserialize;
+
+use crate::arguments::{Source, SourceAt, SourceVerb};
+use crate::ask::refusal;
+use crate::exit::Failure;
+use crate::http::{Change, Server, encoded};
+use crate::live::{Table, harmless, is_coloured};
+use crate::survey::look;
+
+/// Runs `ua-space source`.
+pub(crate) fn source(arguments: &Source) -> Result<(), Failure> {
+    match &arguments.verb {
+        SourceVerb::List { json, at } => list(*json, at),
+        SourceVerb::Add {
+            file,
+            kind,
+            name,
+            at,
+        } => {
+            let contents = read(file)?;
+            let kind = match kind {
+                Some(kind) => kind.clone(),
+                None => kind_of(file, &contents)?.to_owned(),
+            };
+            let name = match name {
+                Some(name) => name.clone(),
+                None => plain_name(file)?,
+            };
+            let path = format!("/sources/{}/{}", encoded(&kind), encoded(&name));
+            let done = change("PUT", &path, ("application/octet-stream", contents), at)?;
+            let verb = if done == CREATED { "added" } else { "replaced" };
+            say(&format!("{kind} {name}: {verb}"))
+        }
+        SourceVerb::Remove { kind, name, at } => {
+            let path = format!("/sources/{}/{}", encoded(kind), encoded(name));
+            change("DELETE", &path, ("", Vec::new()), at)?;
+            say(&format!("{kind} {name}: removed"))
+        }
+        SourceVerb::Update { file, at } => {
+            let update = read(file)?;
+            change("POST", "/update", ("application/sparql-update", update), at)?;
+            say("updated")
+        }
+    }
+}
+
+#[derive(Debug, Deserialize)]
+struct Sources {
+    sources: Vec<Known>,
+    findings: Vec<Finding>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Known {
+    kind: String,
+    name: String,
+    statements: u64,
+    lasting: bool,
+}
+
+#[derive(Debug, Deserialize)]
+struct Finding {
+    kind: String,
+    source: String,
+    what: String,
+}
+
+fn list(json: bool, at: &SourceAt) -> Result<(), Failure> {
+    let server = Server::parse(&at.url)?;
+    look(async {
+        let answer = server.get("/sources").await?;
+        if answer.status != 200 {
+            return Err(refusal(&answer));
+        }
+        let mut out = io::stdout().lock();
+        if json {
+            let text = mappings::harmless_json(answer.body.trim_end());
+            writeln!(out, "{text}")?;
+            return Ok(());
+        }
+        let all: Sources = serde_json::from_str(&answer.body)
+            .map_err(|error| Failure::Data(format!("cannot read the response: {error}")))?;
+        let columns = ["KIND", "SOURCE", "STATEMENTS", "STORED", "FINDING"];
+        let mut table = Table::new(columns.map(str::to_owned));
+        for known in &all.sources {
+            let stored = if known.lasting { "yes" } else { "no" };
+            let of_known = all.findings.iter();
+            let of_known = of_known
+                .filter(|found| found.kind == known.kind && found.source == known.name)
+                .map(|found| found.what.as_str());
+            let findings: Vec<&str> = of_known.collect();
+            table.row([
+                known.kind.clone(),
+                known.name.clone(),
+                known.statements.to_string(),
+                stored.to_owned(),
+                findings.join("; "),
+            ]);
+        }
+        for found in &all.findings {
+            let mut known = all.sources.iter();
+            if !known.any(|known| found.kind == known.kind && found.source == known.name) {
+                table.row([
+                    found.kind.clone(),
+                    found.source.clone(),
+                    "-".to_owned(),
+                    "-".to_owned(),
+                    found.what.clone(),
+                ]);
+            }
+        }
+        table.write(&mut out, is_coloured())?;
+        Ok(())
+    })
+}
+
+/// Sends a change. Returns the status.
+fn change(
+    method: &'static str,
+    path: &str,
+    (content_type, body): (&'static str, Vec<u8>),
+    at: &SourceAt,
+) -> Result<u16, Failure> {
+    let server = Server::parse(&at.url)?;
+    let user = match (&at.user, &at.password) {
+        (Some(user), Some(password)) => Some((user.clone(), password.clone())),
+        (None, None) => None,
+        _ => {
+            let why = "give --user and the variable UA_PASSWORD together";
+            return Err(Failure::Usage(why.to_owned()));
+        }
+    };
+    let change = Change {
+        method,
+        content_type,
+        body,
+        user,
+    };
+    look(async {
+        let answer = server.change(path, change).await?;
+        match answer.status {
+            200..=299 => Ok(answer.status),
+            _ => Err(refusal(&answer)),
+        }
+    })
+}
+
+fn read(file: &str) -> Result<Vec<u8>, Failure> {
+    let mut bytes = Vec::new();
+    let read = match file {
+        "-" => io::stdin().lock().take(LARGEST).read_to_end(&mut bytes),
+        path => File::open(path).and_then(|file| file.take(LARGEST).read_to_end(&mut bytes)),
+    };
+    read.map_err(|error| Failure::reading(crate::input::name(file), &error))?;
+    Ok(bytes)
+}
+
+/// Returns the kind of a source by the name and the contents of its file.
+fn kind_of(file: &str, contents: &[u8]) -> Result<&'static str, Failure> {
+    let ending = Path::new(file).extension();
+    let ending = ending
+        .and_then(|ending| ending.to_str())
+        .unwrap_or_default();
+    let has = |text: &[u8]| contents.windows(text.len()).any(|window| window == text);
+    match ending.to_ascii_lowercase().as_str() {
+        "ttl" | "nt" => Ok("file"),
+        "aml" | "mtp" | "amlx" => Ok("mtp"),
+        "xml" if has(b"UANodeSet") => Ok("nodeset"),
+        "xml" if has(b"CAEXFile") => Ok("mtp"),
+        _ => Err(Failure::Usage(format!(
+            "{file}: give its --kind: file (Turtle), nodeset, mtp or process (Turtle)"
+        ))),
+    }
+}
+
+fn plain_name(file: &str) -> Result<String, Failure> {
+    let name = Path::new(file).file_name().and_then(|name| name.to_str());
+    name.map(str::to_owned)
+        .ok_or_else(|| Failure::Usage(format!("{file}: give the source a name with --as")))
+}
+
+fn say(text: &str) -> Result<(), Failure> {
+    writeln!(io::stdout().lock(), "{}", harmless(text))?;
+    Ok(())
+}
+
+const CREATED: u16 = 201;
+const LARGEST: u64 = 256 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_kind_of_a_source_is_found_by_its_file() {
+        for (file, contents, kind) in [
+            ("a.ttl", "", Some("file")),
+            ("A.MTP", "", Some("mtp")),
+            ("di.xml", "<UANodeSet>", Some("nodeset")),
+            ("m.xml", "<c:CAEXFile>", Some("mtp")),
+            ("x.xml", "<html>", None),
+            ("-", "", None),
+        ] {
+            assert_eq!(kind_of(file, contents.as_bytes()).ok(), kind, "{file}");
+        }
+    }
+}

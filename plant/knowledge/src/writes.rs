@@ -1,0 +1,323 @@
+//! Changes over HTTP: SPARQL 1.1 Update, the Graph Store Protocol, and sources as files.
+
+use std::fmt;
+use std::pin::Pin;
+use std::sync::Arc;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use bytes::Bytes;
+use http_body_util::{BodyExt as _, Full, LengthLimitError, Limited};
+use hyper::body::Incoming;
+use hyper::header::{AUTHORIZATION, CONTENT_TYPE, ORIGIN};
+use hyper::{Method, Request, Response, StatusCode};
+use oxigraph::io::RdfFormat;
+use serde_json::json;
+use tokio::sync::Semaphore;
+
+use crate::http::{
+    Refusal, Site, UPLOAD_TIME, accepted, content, form, is_loopback_host, json_page, unescaped,
+};
+use crate::lanes::Lane;
+use crate::query::{Asked, LARGEST_UPDATE, QueryFault};
+use crate::source::{SourceKind, UNNAMED};
+use crate::store::KnowledgeFault;
+use crate::update::writable;
+
+/// The changes that a server accepts.
+#[derive(Clone)]
+pub struct Writes {
+    /// Returns the time in milliseconds since 1970.
+    pub now: fn() -> u64,
+    /// Returns whether a user with a password, or a client without them, may write.
+    pub may: May,
+    /// The sources that are files of their own formats.
+    pub files: Arc<dyn SourceFiles>,
+}
+
+/// Decides whether a client may write.
+pub type May = Arc<
+    dyn Fn(Option<(String, String)>) -> Pin<Box<dyn Future<Output = bool> + Send>> + Send + Sync,
+>;
+
+/// Sources that are read from files: NodeSets, manifests, Turtle and processes.
+pub trait SourceFiles: Send + Sync {
+    /// Adds or replaces a source. Returns whether it is new.
+    ///
+    /// # Errors
+    /// The reason, with the line if there is one. Then nothing has changed.
+    fn put(&self, kind: SourceKind, name: &str, contents: &[u8]) -> Result<bool, String>;
+
+    /// Removes a source. Returns whether it existed.
+    ///
+    /// # Errors
+    /// The reason why it stays.
+    fn remove(&self, kind: SourceKind, name: &str) -> Result<bool, String>;
+
+    /// Returns all sources and the findings about them, as JSON.
+    fn list(&self) -> serde_json::Value;
+}
+
+impl fmt::Debug for Writes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Writes").finish_non_exhaustive()
+    }
+}
+
+/// The media types of updates.
+pub(crate) const UPDATE: &str = "application/sparql-update";
+
+impl Site {
+    /// Checks whether the client may write: updates are served, the request does not come from a
+    /// page of another site in a browser, and the user has the role.
+    async fn may_write(&self, request: &Request<Incoming>) -> Result<&Writes, Refusal> {
+        let writes = self.writes.as_ref().ok_or(QueryFault::ReadOnly)?;
+        let origin = request.headers().get(ORIGIN);
+        let is_own = origin.is_none_or(|origin| {
+            let origin = origin.to_str().unwrap_or_default();
+            let host = origin.split_once("://").map_or("", |(_, host)| host);
+            is_loopback_host(host)
+        });
+        if !is_own {
+            let why = "pages of other sites cannot change what is known";
+            return Err(Refusal::new(StatusCode::FORBIDDEN, "origin", why));
+        }
+        let user = request.headers().get(AUTHORIZATION).and_then(|value| {
+            let encoded = value.to_str().ok()?.strip_prefix("Basic ")?;
+            let text = String::from_utf8(STANDARD.decode(encoded.trim()).ok()?).ok()?;
+            let (name, password) = text.split_once(':')?;
+            Some((name.to_owned(), password.to_owned()))
+        });
+        if (writes.may)(user).await {
+            Ok(writes)
+        } else {
+            let why = "a change needs the name and password of a user with the role engineer";
+            Err(Refusal::new(StatusCode::UNAUTHORIZED, "user", why))
+        }
+    }
+
+    /// Runs an update of the SPARQL protocol.
+    pub(crate) async fn update(
+        &self,
+        request: Request<Incoming>,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        if request.method() != Method::POST {
+            return Err(Refusal::method("POST"));
+        }
+        let writes = self.may_write(&request).await?;
+        let at = (writes.now)();
+        let media = media(&request);
+        let text = self
+            .upload(request, LARGEST_UPDATE.saturating_mul(3))
+            .await?;
+        let text = String::from_utf8(text)
+            .map_err(|_| Refusal::malformed("the update is not in UTF-8"))?;
+        let text = if media == UPDATE {
+            text
+        } else {
+            let mut updates = form(&text)?.into_iter().filter(|(key, _)| key == "update");
+            match (updates.next(), updates.next()) {
+                (Some((_, text)), None) => text,
+                _ => return Err(Refusal::malformed("give one update as update=")),
+            }
+        };
+        self.found(Asked::Update(text, at), Lane::Write).await
+    }
+
+    /// Reads and writes a graph by the Graph Store Protocol.
+    pub(crate) async fn store(
+        &self,
+        request: Request<Incoming>,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        let pairs = form(request.uri().query().unwrap_or_default())?;
+        let graph = match pairs.as_slice() {
+            [(key, _)] if key == "default" => UNNAMED.to_owned(),
+            [(key, graph)] if key == "graph" => graph.clone(),
+            _ => {
+                let why = "name one graph as ?graph=IRI, or ?default for the graph without a name";
+                return Err(Refusal::malformed(why));
+            }
+        };
+        if !crate::is_iri(&graph) {
+            return Err(QueryFault::Graph(graph).into());
+        }
+        let knowledge = Arc::clone(self.queries.knowledge());
+        let method = request.method().clone();
+        match method {
+            Method::GET | Method::HEAD => {
+                let accepted = accepted(&request);
+                let format = accepted
+                    .iter()
+                    .find_map(|media| RdfFormat::from_media_type(media))
+                    .filter(|format| !format.supports_datasets())
+                    .unwrap_or(RdfFormat::Turtle);
+                let written =
+                    tokio::task::spawn_blocking(move || knowledge.write_triples(&graph, format));
+                match written.await {
+                    Ok(Ok(Some(bytes))) => Ok(content(format.media_type(), bytes)),
+                    Ok(Ok(None)) => Err(Refusal::unknown("there is no such graph".to_owned())),
+                    Ok(Err(error)) => Err(failed(&error)),
+                    Err(error) => Err(failed(&error)),
+                }
+            }
+            Method::PUT | Method::POST => {
+                let at = (self.may_write(&request).await?.now)();
+                let source = writable(&graph)?;
+                let media = media(&request);
+                let format = match media.as_str() {
+                    "" => Some(RdfFormat::Turtle),
+                    media => RdfFormat::from_media_type(media),
+                };
+                let format = format.ok_or_else(|| {
+                    let why = "send text/turtle, application/n-triples or application/rdf+xml";
+                    Refusal::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "media_type", why)
+                })?;
+                let document = self.upload(request, LARGEST_FILE).await?;
+                let adds = method == Method::POST;
+                let taken = tokio::task::spawn_blocking(move || {
+                    knowledge.take(&source, (format, &document), adds, at)
+                });
+                match taken.await {
+                    Ok(is_new) => Ok(status(if is_new? {
+                        StatusCode::CREATED
+                    } else {
+                        StatusCode::NO_CONTENT
+                    })),
+                    Err(error) => Err(failed(&error)),
+                }
+            }
+            Method::DELETE => {
+                self.may_write(&request).await?;
+                if knowledge.remove(&writable(&graph)?)? {
+                    Ok(status(StatusCode::NO_CONTENT))
+                } else {
+                    Err(Refusal::unknown("there is no such graph".to_owned()))
+                }
+            }
+            _ => Err(Refusal::method("GET, HEAD, PUT, POST, DELETE")),
+        }
+    }
+
+    /// Lists, adds, replaces and removes sources: `/sources`, `/sources/KIND/NAME`.
+    pub(crate) async fn sources(
+        &self,
+        request: Request<Incoming>,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        let path = request.uri().path().to_owned();
+        let files = self
+            .writes
+            .as_ref()
+            .map(|writes| Arc::clone(&writes.files))
+            .ok_or(QueryFault::ReadOnly)?;
+        let rest = path.strip_prefix("/sources").unwrap_or_default();
+        if rest.is_empty() {
+            if request.method() != Method::GET {
+                return Err(Refusal::method("GET"));
+            }
+            return Ok(json_page(&files.list()));
+        }
+        let named = rest.trim_start_matches('/').split_once('/');
+        let named = named.and_then(|(kind, name)| {
+            let kind: SourceKind = kind.parse().ok()?;
+            let is_file = matches!(
+                kind,
+                SourceKind::NodeSet | SourceKind::Mtp | SourceKind::File | SourceKind::Process
+            );
+            let name = unescaped(name)?;
+            (is_file && !name.is_empty() && name.len() <= LONGEST_NAME).then_some((kind, name))
+        });
+        let Some((kind, name)) = named else {
+            let why =
+                "a source is /sources/KIND/NAME; the kinds are nodeset, mtp, file and process";
+            return Err(Refusal::unknown(why.to_owned()));
+        };
+        let method = request.method().clone();
+        self.may_write(&request).await?;
+        let done = match method {
+            Method::PUT => {
+                let contents = self.upload(request, LARGEST_FILE).await?;
+                tokio::task::spawn_blocking(move || files.put(kind, &name, &contents)).await
+            }
+            Method::DELETE => {
+                let removed = tokio::task::spawn_blocking(move || files.remove(kind, &name)).await;
+                if let Ok(Ok(false)) = removed {
+                    return Err(Refusal::unknown("there is no such source".to_owned()));
+                }
+                removed.map(|removed| removed.map(|_| false))
+            }
+            _ => return Err(Refusal::method("PUT, DELETE")),
+        };
+        match done {
+            Ok(Ok(true)) => Ok(status(StatusCode::CREATED)),
+            Ok(Ok(false)) => Ok(status(StatusCode::NO_CONTENT)),
+            Ok(Err(why)) => Err(Refusal::new(StatusCode::BAD_REQUEST, "source", &why)),
+            Err(error) => Err(failed(&error)),
+        }
+    }
+
+    /// Reads the body of a change.
+    async fn upload(&self, request: Request<Incoming>, most: usize) -> Result<Vec<u8>, Refusal> {
+        let place = UPLOADS.acquire().await;
+        let _place = place.map_err(|error| failed(&error))?;
+        let body = Limited::new(request.into_body(), most).collect();
+        let body = tokio::time::timeout(UPLOAD_TIME, body).await;
+        let body = body.map_err(|_late| {
+            let why = "the request took too long to come";
+            Refusal::new(StatusCode::REQUEST_TIMEOUT, "slow", why)
+        })?;
+        match body {
+            Ok(body) => Ok(body.to_bytes().into()),
+            Err(error) if error.is::<LengthLimitError>() => {
+                Err(QueryFault::TooLong { most }.into())
+            }
+            Err(_) => Err(Refusal::malformed("the request broke off")),
+        }
+    }
+}
+
+impl From<KnowledgeFault> for Refusal {
+    fn from(fault: KnowledgeFault) -> Self {
+        let (status, code) = match &fault {
+            KnowledgeFault::Protected(_) | KnowledgeFault::Derived => {
+                (StatusCode::FORBIDDEN, "protected")
+            }
+            KnowledgeFault::Turtle(_) | KnowledgeFault::Iri { .. } => {
+                (StatusCode::BAD_REQUEST, "malformed")
+            }
+            KnowledgeFault::TooMany { .. }
+            | KnowledgeFault::TooManySources { .. }
+            | KnowledgeFault::Journal(_) => (StatusCode::INSUFFICIENT_STORAGE, "storage"),
+            KnowledgeFault::Store(_) => (StatusCode::INTERNAL_SERVER_ERROR, "failed"),
+        };
+        Self::new(status, code, &fault.to_string())
+    }
+}
+
+/// Returns the media type of the body without parameters.
+pub(crate) fn media(request: &Request<Incoming>) -> String {
+    let media = request.headers().get(CONTENT_TYPE);
+    let media = media.and_then(|media| media.to_str().ok());
+    let media = media.and_then(|media| media.split(';').next());
+    media.unwrap_or_default().trim().to_ascii_lowercase()
+}
+
+/// Describes an update for the client.
+pub(crate) fn updated(changed: usize) -> Response<Full<Bytes>> {
+    json_page(&json!({ "changed": changed }))
+}
+
+fn status(status: StatusCode) -> Response<Full<Bytes>> {
+    let mut response = Response::new(Full::new(Bytes::new()));
+    *response.status_mut() = status;
+    response
+}
+
+fn failed(error: &dyn fmt::Display) -> Refusal {
+    let status = StatusCode::INTERNAL_SERVER_ERROR;
+    Refusal::new(status, "failed", &error.to_string())
+}
+
+/// Concurrent uploads, each of which is in memory as a whole.
+static UPLOADS: Semaphore = Semaphore::const_new(2);
+const LARGEST_FILE: usize = 256 << 20;
+const LONGEST_NAME: usize = 256;

@@ -1,0 +1,395 @@
+//! Changes of the store: statements of graphs, their merge, and the derived statements.
+
+use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::sync::MutexGuard;
+
+use oxigraph::model::{
+    GraphName, GraphNameRef, NamedNode, NamedNodeRef, NamedOrBlankNode, Term, Triple,
+};
+use oxigraph::store::{StorageError, Transaction};
+use tokio::sync::watch;
+
+use crate::journal::Record;
+use crate::source::{DERIVED, Source, SourceKind};
+use crate::store::{
+    KnowledgeFault, Lasting, MAX_SOURCES, MAX_STATEMENTS, SourceStatus, Written, named,
+};
+use crate::vocabulary;
+
+/// A change of a graph: the statements that it removes and adds.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Change {
+    pub(crate) removed: Vec<Triple>,
+    pub(crate) added: Vec<Triple>,
+}
+
+/// A change of the store. It is undone when it is dropped before the commit.
+pub(crate) struct Writing<'a> {
+    pub(crate) written: MutexGuard<'a, Written>,
+    pub(crate) transaction: Transaction<'a>,
+    changed: &'a watch::Sender<u64>,
+    about_classes: bool,
+    /// The changes for the journal.
+    changes: BTreeMap<Source, Change>,
+    /// Sources that are replaced as a whole, with all their statements.
+    whole: BTreeMap<Source, HashSet<Triple>>,
+    removed: BTreeSet<Source>,
+    pub(crate) lasting: Lasting,
+}
+
+impl<'a> Writing<'a> {
+    /// Begins a change of lasting sources.
+    pub(crate) fn new(
+        written: MutexGuard<'a, Written>,
+        transaction: Transaction<'a>,
+        changed: &'a watch::Sender<u64>,
+    ) -> Self {
+        Self {
+            written,
+            transaction,
+            changed,
+            about_classes: false,
+            changes: BTreeMap::new(),
+            whole: BTreeMap::new(),
+            removed: BTreeSet::new(),
+            lasting: Lasting::Yes,
+        }
+    }
+
+    /// Removes the status of a source with the commit.
+    pub(crate) fn remove(&mut self, source: &Source) {
+        self.removed.insert(source.clone());
+    }
+    /// Returns the transaction, for queries that see the changes.
+    pub(crate) fn transaction(&self) -> &Transaction<'_> {
+        &self.transaction
+    }
+
+    /// Returns the sources.
+    pub(crate) fn sources(&self) -> impl Iterator<Item = &Source> {
+        self.written.sources.keys().chain(self.changes.keys())
+    }
+
+    /// Returns the statements of a source.
+    pub(crate) fn triples(&self, source: &Source) -> Result<HashSet<Triple>, KnowledgeFault> {
+        let graph = named(&source.graph())?;
+        let quads =
+            self.transaction
+                .quads_for_pattern(None, None, None, Some(graph.as_ref().into()));
+        let triples = quads.map(|quad| quad.map(Triple::from));
+        Ok(triples.collect::<Result<_, _>>()?)
+    }
+
+    pub(crate) fn replace(
+        &mut self,
+        source: &Source,
+        triples: HashSet<Triple>,
+    ) -> Result<(), KnowledgeFault> {
+        let graph = named(&source.graph())?;
+        let (added, removed) = difference(&self.transaction, &graph, &triples)?;
+        self.change(source, Change { removed, added })?;
+        self.changes.remove(source);
+        // The journal has literals as the store has them, so that a later removal finds them.
+        let whole = match self.lasting {
+            Lasting::Yes => self.triples(source)?,
+            Lasting::No => triples,
+        };
+        self.whole.insert(source.clone(), whole);
+        Ok(())
+    }
+
+    /// Changes the statements of a source. Statements that are there already, or are not there,
+    /// are left as they are. Returns the number of changed statements.
+    pub(crate) fn change(
+        &mut self,
+        source: &Source,
+        change: Change,
+    ) -> Result<usize, KnowledgeFault> {
+        if source.kind == SourceKind::Derived {
+            return Err(KnowledgeFault::Derived);
+        }
+        let is_new = !self.written.sources.contains_key(source)
+            && !self.changes.contains_key(source)
+            && !self.whole.contains_key(source);
+        if is_new && self.written.sources.len() + self.changes.len() >= MAX_SOURCES {
+            return Err(KnowledgeFault::TooManySources { most: MAX_SOURCES });
+        }
+        let graph = named(&source.graph())?;
+        let mut effective = Change::default();
+        for triple in &change.removed {
+            if let Some(known) = stored(&self.transaction, &graph, triple)? {
+                self.transaction.remove(known.as_ref().in_graph(&graph));
+                effective.removed.push(known);
+            }
+        }
+        for triple in &change.added {
+            if stored(&self.transaction, &graph, triple)?.is_none() {
+                self.transaction.insert(triple.as_ref().in_graph(&graph));
+                effective
+                    .added
+                    .extend(stored(&self.transaction, &graph, triple)?);
+            }
+        }
+        merge(
+            &mut self.transaction,
+            &graph,
+            &effective.added,
+            &effective.removed,
+        )?;
+        let sub_class = vocabulary::RDFS_SUB_CLASS_OF;
+        let mut all = effective.added.iter().chain(&effective.removed);
+        self.about_classes |= all.any(|triple| triple.predicate.as_str() == sub_class);
+        let count = effective.added.len() + effective.removed.len();
+        let kept = self.changes.entry(source.clone()).or_default();
+        kept.then(effective);
+        Ok(count)
+    }
+
+    /// Stores the changes of lasting sources, and makes all changes visible.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`]; then nothing has changed.
+    pub(crate) fn commit(mut self, at: u64) -> Result<(), KnowledgeFault> {
+        let mut statuses: Vec<(Source, SourceStatus)> = Vec::new();
+        for source in self.changes.keys().chain(self.whole.keys()) {
+            if self.removed.contains(source) {
+                continue;
+            }
+            let known = self.written.sources.get(source);
+            let mut status = known
+                .cloned()
+                .unwrap_or_else(|| SourceStatus::new(source, at));
+            status.statements = match (self.whole.get(source), self.changes.get(source)) {
+                (Some(triples), _) => triples.len(),
+                (None, Some(change)) => {
+                    let grown = status.statements.saturating_add(change.added.len());
+                    grown.saturating_sub(change.removed.len())
+                }
+                (None, None) => status.statements,
+            };
+            if status.statements > MAX_STATEMENTS {
+                return Err(KnowledgeFault::TooMany {
+                    most: MAX_STATEMENTS,
+                });
+            }
+            if source.kind == SourceKind::Graph && status.statements == 0 {
+                self.removed.insert(source.clone());
+                continue;
+            }
+            let was_lasting = status.lasting;
+            status.lasting = self.lasting == Lasting::Yes && self.written.journal.is_some();
+            if was_lasting && !status.lasting {
+                self.removed.insert(source.clone());
+            }
+            statuses.push((source.clone(), status));
+        }
+        let derived = match self.about_classes {
+            true => Some(derive(&mut self.transaction)?),
+            false => None,
+        };
+        let written = &mut *self.written;
+        if let Some(journal) = &mut written.journal {
+            let mut records = Vec::new();
+            for source in &self.removed {
+                if written
+                    .sources
+                    .get(source)
+                    .is_some_and(|known| known.lasting)
+                {
+                    records.push(Record::Remove { source });
+                }
+            }
+            if self.lasting == Lasting::Yes {
+                let puts = self.whole.iter();
+                records.extend(puts.map(|(source, triples)| Record::Put {
+                    source,
+                    at,
+                    triples,
+                }));
+                let changes = self
+                    .changes
+                    .iter()
+                    .filter(|(source, _)| !self.removed.contains(*source));
+                records.extend(changes.map(|(source, change)| Record::Change {
+                    source,
+                    at,
+                    change,
+                }));
+            }
+            journal.append(&records)?;
+        }
+        self.transaction.commit()?;
+        for source in &self.removed {
+            written.sources.remove(source);
+        }
+        written.sources.extend(statuses);
+        match derived {
+            Some(derived) => written.count_derived(derived),
+            None => {
+                let known = Source::new(SourceKind::Derived, "");
+                let known = written.sources.get(&known);
+                let derived = known.map_or(0, |known| known.statements);
+                written.count_derived(derived);
+            }
+        }
+        self.changed.send_modify(|changes| *changes += 1);
+        Ok(())
+    }
+}
+
+impl Change {
+    /// Adds a later change.
+    fn then(&mut self, later: Self) {
+        let removed: HashSet<&Triple> = later.removed.iter().collect();
+        self.added.retain(|triple| !removed.contains(triple));
+        self.removed.extend(later.removed);
+        self.added.extend(later.added);
+    }
+}
+
+/// Updates the graph of derived statements. Returns their number.
+pub(crate) fn derive(transaction: &mut Transaction<'_>) -> Result<usize, KnowledgeFault> {
+    let sub_class = NamedNodeRef::new_unchecked(vocabulary::RDFS_SUB_CLASS_OF);
+    let derived = named(DERIVED)?;
+    let closure = closure(transaction, sub_class, &derived)?;
+    let (added, removed) = difference(transaction, &derived, &closure)?;
+    apply(transaction, &derived, &added, &removed)?;
+    Ok(closure.len())
+}
+
+/// Returns the statements to add to a graph and to remove from it.
+fn difference(
+    transaction: &Transaction<'_>,
+    graph: &NamedNode,
+    wanted: &HashSet<Triple>,
+) -> Result<(Vec<Triple>, Vec<Triple>), StorageError> {
+    let present = transaction
+        .quads_for_pattern(None, None, None, Some(graph.into()))
+        .map(|quad| quad.map(Triple::from))
+        .collect::<Result<HashSet<_>, _>>()?;
+    let added = wanted.difference(&present).cloned().collect();
+    let removed = present.difference(wanted).cloned().collect();
+    Ok((added, removed))
+}
+
+fn apply(
+    transaction: &mut Transaction<'_>,
+    graph: &NamedNode,
+    added: &[Triple],
+    removed: &[Triple],
+) -> Result<(), StorageError> {
+    // The store keeps literals in their canonical form: `.120Z` is added again while `.12Z` is
+    // removed. Statements are therefore removed before others are added.
+    for triple in removed {
+        transaction.remove(triple.as_ref().in_graph(graph));
+    }
+    for triple in added {
+        transaction.insert(triple.as_ref().in_graph(graph));
+    }
+    merge(transaction, graph, added, removed)
+}
+
+/// Updates the default graph after a change of a graph.
+fn merge(
+    transaction: &mut Transaction<'_>,
+    graph: &NamedNode,
+    added: &[Triple],
+    removed: &[Triple],
+) -> Result<(), StorageError> {
+    for triple in removed {
+        let (subject, predicate, object) = (
+            triple.subject.as_ref(),
+            triple.predicate.as_ref(),
+            triple.object.as_ref(),
+        );
+        let mut said =
+            transaction.quads_for_pattern(Some(subject), Some(predicate), Some(object), None);
+        let elsewhere = said.find(|quad| {
+            quad.as_ref()
+                .map_or(true, |quad| !quad.graph_name.is_default_graph())
+        });
+        let is_said = elsewhere.transpose()?.is_some();
+        drop(said);
+        if !is_said {
+            transaction.remove(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
+        }
+    }
+    for triple in added {
+        transaction.insert(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
+    }
+    // A graph without statements does not exist.
+    let is_empty = transaction
+        .quads_for_pattern(None, None, None, Some(graph.into()))
+        .next()
+        .is_none();
+    if is_empty {
+        transaction.remove_named_graph(graph)?;
+    }
+    Ok(())
+}
+
+/// Returns a statement of a graph as the store has it: literals are in their canonical form.
+fn stored(
+    transaction: &Transaction<'_>,
+    graph: &NamedNode,
+    triple: &Triple,
+) -> Result<Option<Triple>, StorageError> {
+    let mut quads = transaction.quads_for_pattern(
+        Some(triple.subject.as_ref()),
+        Some(triple.predicate.as_ref()),
+        Some(triple.object.as_ref()),
+        Some(graph.into()),
+    );
+    let quad = quads.next().transpose()?;
+    Ok(quad.map(Triple::from))
+}
+
+/// Applies the rule for subclasses: transitive through any number of classes, and reflexive.
+/// Questions never need a path (`rdfs:subClassOf*`), which the evaluator would follow last and for
+/// all classes.
+fn closure(
+    transaction: &Transaction<'_>,
+    sub_class: NamedNodeRef<'_>,
+    derived: &NamedNode,
+) -> Result<HashSet<Triple>, StorageError> {
+    let mut above: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for quad in transaction.quads_for_pattern(None, Some(sub_class), None, None) {
+        let quad = quad?;
+        let is_direct = matches!(&quad.graph_name, GraphName::NamedNode(graph) if graph != derived);
+        if let (NamedOrBlankNode::NamedNode(class), Term::NamedNode(supertype), true) =
+            (quad.subject, quad.object, is_direct)
+        {
+            above.entry(supertype.as_str().to_owned()).or_default();
+            above
+                .entry(class.into_string())
+                .or_default()
+                .insert(supertype.into_string());
+        }
+    }
+    let mut all = HashSet::new();
+    for class in above.keys() {
+        let mut seen: BTreeSet<&str> = BTreeSet::from([class.as_str()]);
+        let mut waiting = vec![class.as_str()];
+        while let Some(next) = waiting.pop() {
+            let further = above.get(next).into_iter().flatten();
+            waiting.extend(
+                further
+                    .map(String::as_str)
+                    .filter(|further| seen.insert(further)),
+            );
+        }
+        if all.len() + seen.len() > MAX_DERIVED {
+            tracing::warn!(
+                most = MAX_DERIVED,
+                "the classes have more superclasses than are kept; questions about types miss some"
+            );
+            break;
+        }
+        let class = NamedNode::new_unchecked(class);
+        let above = seen.into_iter().map(NamedNode::new_unchecked);
+        all.extend(above.map(|above| Triple::new(class.clone(), sub_class, above)));
+    }
+    Ok(all)
+}
+
+const MAX_DERIVED: usize = 500_000;

@@ -1,0 +1,284 @@
+//! Changes over HTTP: updates, the Graph Store Protocol, and who may make them.
+
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex};
+
+use knowledge::{Endpoint, Knowledge, Limits, Source, SourceFiles, SourceKind, Writes};
+
+use crate::http::{Answered, send};
+
+/// Keeps the sources that it is given.
+#[derive(Default)]
+struct Files(Mutex<Vec<(SourceKind, String, usize)>>);
+
+impl SourceFiles for Files {
+    fn put(&self, kind: SourceKind, name: &str, contents: &[u8]) -> Result<bool, String> {
+        if contents.is_empty() {
+            return Err("line 7: it is empty".to_owned());
+        }
+        let mut all = self.0.lock().unwrap();
+        all.push((kind, name.to_owned(), contents.len()));
+        Ok(all.len() == 1)
+    }
+
+    fn remove(&self, kind: SourceKind, name: &str) -> Result<bool, String> {
+        let mut all = self.0.lock().unwrap();
+        let before = all.len();
+        all.retain(|known| (known.0, known.1.as_str()) != (kind, name));
+        Ok(all.len() < before)
+    }
+
+    fn list(&self) -> serde_json::Value {
+        serde_json::json!({ "sources": self.0.lock().unwrap().len() })
+    }
+}
+
+async fn site(may: bool) -> (Endpoint, Arc<Knowledge>) {
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let turtle = "<urn:c:below> <http://www.w3.org/2000/01/rdf-schema#subClassOf> <urn:c:above> .";
+    let source = Source::new(SourceKind::File, "classes");
+    knowledge.replace_turtle(&source, turtle, 5).unwrap();
+    let writes = Writes {
+        now: || 9,
+        may: Arc::new(move |user| {
+            let is_anna = user == Some(("anna".to_owned(), "secret: 1".to_owned()));
+            Box::pin(async move { may || is_anna })
+        }),
+        files: Arc::new(Files::default()),
+    };
+    let endpoint = Endpoint::bind_with(
+        "127.0.0.1:0".parse().unwrap(),
+        Arc::clone(&knowledge),
+        Limits::default(),
+        Arc::new(|_: &str| None),
+        Some(writes),
+    )
+    .await
+    .unwrap();
+    (endpoint, knowledge)
+}
+
+/// Sends a request with headers and a body.
+async fn request(at: SocketAddr, line: &str, headers: &[(&str, &str)], body: &str) -> Answered {
+    let mut text = format!("{line} HTTP/1.1\r\nHost: {at}\r\nConnection: close\r\n");
+    for (name, value) in headers {
+        text.push_str(&format!("{name}: {value}\r\n"));
+    }
+    let length = body.len();
+    send(at, format!("{text}Content-Length: {length}\r\n\r\n{body}")).await
+}
+
+const UPDATE: (&str, &str) = ("Content-Type", "application/sparql-update");
+const TURTLE: (&str, &str) = ("Content-Type", "text/turtle");
+
+async fn update(at: SocketAddr, text: &str) -> Answered {
+    request(at, "POST /update", &[UPDATE], text).await
+}
+
+/// Returns the rows of a query as CSV, sorted.
+async fn rows(at: SocketAddr, query: &str) -> Vec<String> {
+    let headers = [
+        ("Content-Type", "application/sparql-query"),
+        ("Accept", "text/csv"),
+    ];
+    let answer = request(at, "POST /sparql", &headers, query).await;
+    assert_eq!(answer.status, 200, "{}", answer.body);
+    let mut rows: Vec<String> = answer.body.lines().skip(1).map(str::to_owned).collect();
+    rows.sort_unstable();
+    rows
+}
+
+#[tokio::test]
+async fn updates_change_graphs_of_users() {
+    let (endpoint, _) = site(true).await;
+    let at = endpoint.address();
+    let named = "SELECT ?g ?s ?o { GRAPH ?g { ?s <urn:p> ?o } }";
+    let done = update(
+        at,
+        "INSERT DATA { <urn:a> <urn:p> 1 . GRAPH <urn:g> { <urn:b> <urn:p> 2 , 02 } }",
+    )
+    .await;
+    assert_eq!((done.status, done.body.trim()), (200, r#"{"changed":2}"#));
+    let expected = ["urn:g,urn:b,2", "urn:ua-bridge:graph:unnamed,urn:a,1"];
+    assert_eq!(rows(at, named).await, expected);
+    // Several operations see each other, and are one change.
+    let modify = "DELETE { GRAPH <urn:g> { ?s <urn:p> ?o } } INSERT { GRAPH <urn:h> { ?s <urn:p> ?more . ?s <urn:q> [] } }
+        WHERE { GRAPH <urn:g> { ?s <urn:p> ?o } BIND(?o + 1 AS ?more) } ;
+        INSERT { ?s <urn:p> \"seen\" } WHERE { GRAPH <urn:h> { ?s <urn:p> 3 } }";
+    assert_eq!(update(at, modify).await.status, 200);
+    let expected = [
+        "urn:h,urn:b,3",
+        "urn:ua-bridge:graph:unnamed,urn:a,1",
+        "urn:ua-bridge:graph:unnamed,urn:b,seen",
+    ];
+    assert_eq!(rows(at, named).await, expected);
+    // The merge of all graphs follows.
+    assert_eq!(rows(at, "SELECT ?s ?o { ?s <urn:p> ?o }").await.len(), 3);
+    // The form of the protocol, and a deletion.
+    let form = ("Content-Type", "application/x-www-form-urlencoded");
+    let text = "update=DELETE+DATA+%7B+%3Curn%3Aa%3E+%3Curn%3Ap%3E+1+%7D";
+    let done = request(at, "POST /update", &[form], text).await;
+    assert_eq!(done.status, 200, "{}", done.body);
+    assert_eq!(update(at, "DROP GRAPH <urn:h>").await.status, 200);
+    let expected = ["urn:ua-bridge:graph:unnamed,urn:b,seen"];
+    assert_eq!(rows(at, named).await, expected);
+    // Classes that users add have their superclasses, and lose them again.
+    let sub = "<http://www.w3.org/2000/01/rdf-schema#subClassOf>";
+    let data = format!("{{ <urn:c:new> {sub} <urn:c:below> }}");
+    let above = format!("SELECT ?above {{ <urn:c:new> {sub} ?above }}");
+    assert_eq!(update(at, &format!("INSERT DATA {data}")).await.status, 200);
+    let expected = ["urn:c:above", "urn:c:below", "urn:c:new"];
+    assert_eq!(rows(at, &above).await, expected);
+    assert_eq!(update(at, &format!("DELETE DATA {data}")).await.status, 200);
+    assert!(rows(at, &above).await.is_empty());
+    assert_eq!(update(at, "CLEAR ALL").await.status, 200);
+    assert!(rows(at, named).await.is_empty());
+    assert!(
+        !rows(at, &format!("SELECT ?s {{ ?s {sub} ?o }}"))
+            .await
+            .is_empty()
+    );
+}
+
+#[tokio::test]
+async fn an_update_changes_all_or_nothing_and_no_graph_of_a_source() {
+    let (endpoint, _) = site(true).await;
+    let at = endpoint.address();
+    let source = "urn:ua-bridge:graph:file:classes";
+    for (text, status, code) in [
+        (
+            format!("INSERT DATA {{ <urn:a> <urn:p> 1 }} ; CLEAR GRAPH <{source}>"),
+            403,
+            "protected",
+        ),
+        (
+            format!("DELETE WHERE {{ GRAPH <{source}> {{ ?s ?p ?o }} }}"),
+            403,
+            "protected",
+        ),
+        (
+            "INSERT { GRAPH ?g { ?s ?p ?o } } WHERE { GRAPH ?g { ?s ?p ?o } }".to_owned(),
+            403,
+            "protected",
+        ),
+        ("LOAD <http://127.0.0.1/x>".to_owned(), 400, "service"),
+        (
+            "INSERT { ?s ?p ?o } WHERE { SERVICE <urn:x> { ?s ?p ?o } }".to_owned(),
+            400,
+            "service",
+        ),
+        (
+            "INSERT DATA { <urn:a> <urn:p> }".to_owned(),
+            400,
+            "malformed",
+        ),
+    ] {
+        let refused = update(at, &text).await;
+        assert_eq!(refused.status, status, "{text}: {}", refused.body);
+        assert!(refused.body.contains(code), "{text}: {}", refused.body);
+    }
+    assert!(rows(at, "SELECT ?s { ?s <urn:p> ?o }").await.is_empty());
+    let graph = format!("SELECT ?s {{ GRAPH <{source}> {{ ?s ?p ?o }} }}");
+    assert_eq!(rows(at, &graph).await, ["urn:c:below"]);
+}
+
+#[tokio::test]
+async fn a_graph_is_put_posted_read_and_deleted() {
+    let (endpoint, _) = site(true).await;
+    let at = endpoint.address();
+    let path = "/store?graph=urn%3Ag";
+    let of = |verb: &str| format!("{verb} {path}");
+    let document = "<urn:a> <urn:p> 1 .";
+    assert_eq!(request(at, &of("GET"), &[], "").await.status, 404);
+    let put = request(at, &of("PUT"), &[TURTLE], document).await;
+    assert_eq!(put.status, 201, "{}", put.body);
+    let post = request(at, &of("POST"), &[TURTLE], "<urn:b> <urn:p> 2 .").await;
+    assert_eq!(post.status, 204);
+    let accept = ("Accept", "application/n-triples");
+    let read = request(at, &of("GET"), &[accept], "").await;
+    let mut lines: Vec<&str> = read.body.lines().collect();
+    lines.sort_unstable();
+    let integer = "\"^^<http://www.w3.org/2001/XMLSchema#integer> .";
+    let expected = [
+        format!("<urn:a> <urn:p> \"1{integer}"),
+        format!("<urn:b> <urn:p> \"2{integer}"),
+    ];
+    assert_eq!(lines, expected);
+    assert_eq!(
+        request(at, &of("PUT"), &[TURTLE], document).await.status,
+        204
+    );
+    assert_eq!(rows(at, "SELECT ?s { ?s <urn:p> ?o }").await, ["urn:a"]);
+    let wrong = request(at, &of("PUT"), &[TURTLE], "<urn:a>\n<urn:p> .\n").await;
+    assert_eq!(wrong.status, 400);
+    assert!(wrong.body.contains("line 2"), "{}", wrong.body);
+    let json = ("Content-Type", "application/json");
+    assert_eq!(request(at, &of("PUT"), &[json], "{}").await.status, 415);
+    assert_eq!(request(at, &of("DELETE"), &[], "").await.status, 204);
+    assert_eq!(request(at, &of("DELETE"), &[], "").await.status, 404);
+    let unnamed = request(at, "PUT /store?default", &[TURTLE], document).await;
+    assert_eq!(unnamed.status, 201);
+    let source = "PUT /store?graph=urn%3Aua-bridge%3Agraph%3Afile%3Aclasses";
+    assert_eq!(request(at, source, &[TURTLE], document).await.status, 403);
+    assert_eq!(
+        request(at, "PUT /store", &[TURTLE], document).await.status,
+        400
+    );
+}
+
+#[tokio::test]
+async fn sources_are_handed_to_their_readers() {
+    let (endpoint, _) = site(true).await;
+    let at = endpoint.address();
+    let put = async |path: &str, body: &str| request(at, &format!("PUT {path}"), &[], body).await;
+    assert_eq!(put("/sources/mtp/a%20module", "x").await.status, 201);
+    assert_eq!(put("/sources/mtp/a%20module", "xy").await.status, 204);
+    let wrong = put("/sources/nodeset/x", "").await;
+    assert_eq!(wrong.status, 400);
+    assert!(wrong.body.contains("line 7"), "{}", wrong.body);
+    for path in ["/sources/run/x", "/sources/mtp/", "/sources/x"] {
+        assert_eq!(put(path, "x").await.status, 404, "{path}");
+    }
+    let listed = request(at, "GET /sources", &[], "").await;
+    assert_eq!(listed.body.trim(), r#"{"sources":2}"#);
+    let remove = "DELETE /sources/mtp/a%20module";
+    assert_eq!(request(at, remove, &[], "").await.status, 204);
+    assert_eq!(request(at, remove, &[], "").await.status, 404);
+}
+
+#[tokio::test]
+async fn only_users_with_the_role_write_and_no_page_of_another_site() {
+    let (endpoint, knowledge) = site(false).await;
+    let at = endpoint.address();
+    let text = "INSERT DATA { <urn:a> <urn:p> 1 }";
+    // base64 of `anna:secret: 1`, and of `anna:wrong`.
+    let anna = ("Authorization", "Basic YW5uYTpzZWNyZXQ6IDE=");
+    let wrong = ("Authorization", "Basic YW5uYTp3cm9uZw==");
+    let before = *knowledge.changes().borrow();
+    for headers in [
+        &[UPDATE][..],
+        &[UPDATE, wrong],
+        &[UPDATE, ("Authorization", "Basic %")],
+    ] {
+        let refused = request(at, "POST /update", headers, text).await;
+        assert_eq!(refused.status, 401, "{}", refused.body);
+    }
+    for line in [
+        "PUT /store?default",
+        "DELETE /store?default",
+        "PUT /sources/mtp/x",
+        "DELETE /sources/mtp/x",
+    ] {
+        assert_eq!(request(at, line, &[], "x").await.status, 401, "{line}");
+    }
+    let elsewhere = ("Origin", "http://evil.example");
+    let refused = request(at, "POST /update", &[UPDATE, anna, elsewhere], text).await;
+    assert_eq!(refused.status, 403, "{}", refused.body);
+    assert_eq!(*knowledge.changes().borrow(), before);
+    let own = ("Origin", "http://localhost:3000");
+    let done = request(at, "POST /update", &[UPDATE, anna, own], text).await;
+    assert_eq!(done.status, 200, "{}", done.body);
+    assert_eq!(*knowledge.changes().borrow(), before + 1);
+    // Queries need no user.
+    assert_eq!(rows(at, "SELECT ?s { ?s <urn:p> ?o }").await, ["urn:a"]);
+}
