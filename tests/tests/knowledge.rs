@@ -258,5 +258,12 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
         );
     }
     // No process has run, and no process is known.
-    assert_eq!(empty, ["processes", "run-steps", "runs"]);
+    let expected = [
+        "process-parameters",
+        "process-steps",
+        "processes",
+        "run-steps",
+        "runs",
+    ];
+    assert_eq!(empty, expected);
 }

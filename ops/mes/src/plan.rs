@@ -210,7 +210,7 @@ fn bind(
                     fits(**known)
                         .any(|one| fits(number).any(|other| one.component == other.component))
                 };
-                let with = open.iter().rev().find(can).or(open.last()).copied();
+                let with = open.iter().rev().find(can).or_else(|| open.last()).copied();
                 if let Some(with) = with {
                     join(number, with);
                     open.retain(|known| *known != with);

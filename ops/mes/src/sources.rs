@@ -206,7 +206,7 @@ impl SourceFiles for Sources {
         self.state().findings.remove(&source);
         match (kind, read) {
             (SourceKind::NodeSet, Some(read)) => {
-                Sources::put(self, &source, &read.triples, Lasting::Yes)?;
+                Self::put(self, &source, &read.triples, Lasting::Yes)?;
             }
             (SourceKind::Mtp, _) => {
                 let manifest = Manifest {

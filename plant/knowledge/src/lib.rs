@@ -46,9 +46,7 @@ pub use writes::{May, SourceFiles, Writes};
 #[cfg(test)]
 fn test_folder(name: &str) -> std::path::PathBuf {
     let folder = std::env::temp_dir().join(format!("knowledge-{name}-{}", std::process::id()));
-    if folder.exists() {
-        std::fs::remove_dir_all(&folder).unwrap();
-    }
-    std::fs::create_dir_all(&folder).unwrap();
+    drop(std::fs::remove_dir_all(&folder));
+    drop(std::fs::create_dir_all(&folder));
     folder
 }
