@@ -691,6 +691,19 @@ impl Variable {
         self.bindings.iter().find(|binding| binding.space == space)
     }
 
+    /// Returns the ROS topics and services that it is bound to, each with its space.
+    pub fn ros_names(&self) -> impl Iterator<Item = (SpaceId, &str)> {
+        let topics = self.bindings.iter();
+        let topics = topics.map(|binding| (binding.space, binding.ros_topic.as_str()));
+        let service = self.service.as_deref().and_then(|bound| match &bound.role {
+            ServiceRole::Call { service, .. } | ServiceRole::Poll { service, .. } => {
+                Some((bound.space, service.as_str()))
+            }
+            ServiceRole::Answer { .. } => None,
+        });
+        topics.chain(service)
+    }
+
     /// Returns the other spaces with topics or services that get its values.
     pub fn destinations(&self) -> impl Iterator<Item = SpaceId> {
         let called = self.service.as_ref();

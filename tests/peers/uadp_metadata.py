@@ -52,6 +52,7 @@ def announcement(datagram):
         writer=writer,
         status=status,
         name=meta.Name,
+        topic_name=(meta.Name or "").split(" ")[0],
         description=meta.Description.Text,
         version=meta.ConfigurationVersion.MajorVersion,
         structures=[one.Name.Name for one in meta.StructureDataTypes],

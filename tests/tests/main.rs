@@ -16,6 +16,7 @@ mod crossing;
 mod dds_peers;
 mod discovery;
 mod dissector;
+mod doctor;
 mod init;
 mod interfaces;
 mod knowledge;

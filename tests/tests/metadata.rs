@@ -118,7 +118,7 @@ fn asyncua_reads_what_topics_consist_of_and_structures_by_it() {
     );
     let mut of = |name: &str| {
         judge.wait_for_json(name, SOON, |line| {
-            (line["name"] == name).then(|| line.clone())
+            (line["topic_name"] == name).then(|| line.clone())
         })
     };
     let whole = of("ua_1_2_10");
@@ -143,12 +143,18 @@ fn asyncua_reads_what_topics_consist_of_and_structures_by_it() {
     // The UnitId encodes the characters of "MTS".
     assert_eq!(
         velocity,
-        &json!({"EngineeringUnits": [unit, 5_067_859, "m/s", "metre per second"], "EURange": [-1.0, 1.5]})
+        &json!({"EngineeringUnits": [unit, 5_067_859, "m/s", "metre per second"], "EURange": [-1.0, 1.5], "RosTopics": ["1 /speed"]})
     );
     let mode = &of("ua_1_2_14")["fields"][0]["properties"];
-    assert_eq!(mode, &json!({"EnumStrings": ["idle", "moving"]}));
+    assert_eq!(
+        mode,
+        &json!({"EnumStrings": ["idle", "moving"], "RosTopics": ["1 /mode"]})
+    );
     let fault = &of("ua_1_2_15")["fields"][0]["properties"];
-    assert_eq!(fault, &json!({"EnumValues": [[-1, "none"], [7, "jammed"]]}));
+    assert_eq!(
+        fault,
+        &json!({"EnumValues": [[-1, "none"], [7, "jammed"]], "RosTopics": ["1 /fault"]})
+    );
 
     let said = of("ua_1_2_12");
     assert_eq!(
@@ -212,7 +218,7 @@ fn asyncua_reads_what_the_values_are_that_clients_write() {
     let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
     let mut of = |name: &str| {
         judge.wait_for_json(name, SOON, |line| {
-            (line["name"] == name).then(|| line.clone())
+            (line["topic_name"] == name).then(|| line.clone())
         })
     };
     let wanted = of("ua_0_2_20");

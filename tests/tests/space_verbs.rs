@@ -5,7 +5,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Capture, Cell, METRICS_ROS1, Peer, Started, UadpSocket, eventually, program};
+use system_tests::{
+    Capture, Cell, METRICS_ROS1, Peer, Started, UadpSocket, eventually, metrics, program,
+};
 
 const SOON: Duration = Duration::from_secs(30);
 const TWIST: &str = "geometry_msgs/Twist";
@@ -96,6 +98,121 @@ fn what_a_ros_1_node_publishes_is_listed_echoed_and_measured_without_a_mapping()
             row["max_us"].as_f64() >= row["p50_us"].as_f64() && row["count"].as_u64() > Some(0),
             "{row}"
         );
+    }
+}
+
+const NAMED: &str = r#"
+spaces: [{id: 1}]
+namespaces: {2: urn:test}
+variables:
+  - {node: ns=2;i=10, name: Left.Speed, origin: 1, ros: {topic: /left/speed, type: geometry_msgs/Twist}}
+  - {node: ns=2;i=11, name: Right.Speed, origin: 1, ros: {topic: /right/speed, type: geometry_msgs/Twist}}
+  - {node: ns=2;i=12, name: Right.Forward, origin: 1, ros: {topic: /right/speed, type: geometry_msgs/Twist, field: linear.x}}
+"#;
+
+#[test]
+fn mapped_topics_are_listed_echoed_and_completed_by_their_names_and_ros_topics() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let mapping = cell.file("cell.yaml", NAMED);
+    let _master = cell.roscore();
+    let _bridge = cell.bridge_ros1(&[mapping.to_str().unwrap()]);
+    let twist = json!({"linear": {"x": 0.5, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": 0.0}});
+    let value = twist.to_string();
+    let _nodes = ["left", "right"].map(|side| {
+        let topic = format!("/{side}/speed");
+        let words = ["--node", side, "--repeat", "0", "--value", &value];
+        cell.rospy("ros1_pub.py", &[&[&topic, TWIST], &words[..]].concat())
+    });
+    let listed = eventually("both topics are listed with their names", SOON, || {
+        let (code, lines) = ua_space(&["list", "--topics", "--seconds", "1", "--json"]);
+        assert_eq!(code, 0, "{lines:?}");
+        let all = objects(&lines).pop()?;
+        let of = |topic: &str| {
+            let mut all = all["topics"].as_array()?.iter();
+            all.find(|line| line["topic"] == topic && line["name"].is_string())
+                .cloned()
+        };
+        Some([of("ua_1_2_10")?, of("ua_1_2_11")?, of("ua_1_2_12")?])
+    });
+    let names: Vec<&Value> = listed.iter().map(|line| &line["name"]).collect();
+    assert_eq!(names, ["Left.Speed", "Right.Speed", "Right.Forward"]);
+    let ros = json!([{"space": 1, "topic": "/left/speed"}]);
+    assert_eq!(
+        (&listed[0]["ros_topics"], &listed[0]["quality"]),
+        (&ros, &json!("Good"))
+    );
+    let lines = eventually("the table has the names", SOON, || {
+        let (_, lines) = ua_space(&["list", "--topics", "--seconds", "1"]);
+        let row = lines.iter().find(|line| line.starts_with("ua_1_2_10"))?;
+        (row.contains("Left.Speed") && row.contains("/left/speed")).then_some(lines)
+    });
+    let narrow = |line: &String| line.chars().count() <= 80;
+    assert!(lines.iter().all(narrow), "{lines:?}");
+
+    for name in ["Left.Speed", "/left/speed", "left/speed"] {
+        let (code, lines) = ua_space(&["echo", name, "-n", "1", "--json"]);
+        let shown = objects(&lines).pop().unwrap_or_default();
+        assert_eq!(
+            (code, &shown["topic"]),
+            (0, &json!("ua_1_2_10")),
+            "{name}: {lines:?}"
+        );
+        assert_eq!(shown["value"]["linear.x"], 0.5);
+    }
+    for name in ["Speed", "/right/speed"] {
+        let lines = eventually("the name is ambiguous", SOON, || {
+            let (code, lines) = ua_space(&["echo", name, "-n", "1"]);
+            (code == 64).then_some(lines)
+        });
+        let listed = |topic: &str| lines.iter().any(|line| line.contains(topic));
+        assert!(
+            listed("is the name of 2 topics") && listed("ua_1_2_11"),
+            "{lines:?}"
+        );
+    }
+    eventually("the shell completes the name", SOON, || {
+        let offered = completed(&["echo", "--interface", "lo", "Left"]);
+        (offered == ["Left.Speed"]).then_some(())
+    });
+    let status = metrics(METRICS_ROS1).unwrap();
+    assert_eq!(status["topics"]["ua_1_2_10"]["name"], "Left.Speed");
+    eventually("top shows the topic by its name", SOON, || {
+        let (code, lines) = ua_space(&["top", "--seconds", "2", "--sort", "name"]);
+        assert_eq!(code, 0, "{lines:?}");
+        let row = lines.iter().find(|line| line.starts_with("ua_1_2_10"))?;
+        row.contains("Left.Speed").then_some(())
+    });
+    eventually("the bandwidth is measured", SOON, || {
+        let (_, lines) = ua_space(&["bw", "/left/speed", "--seconds", "3", "--json"]);
+        let load = objects(&lines).pop()?;
+        (load["bytes_per_second"].as_f64() > Some(0.0)).then_some(())
+    });
+}
+
+#[test]
+fn starting_files_are_accepted_by_their_programs() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let run = |name: &str, words: &[&str]| {
+        let mut child = Started::new(name, &program(name)).args(words).start();
+        (child.wait_for_end(SOON).code().unwrap(), child.lines())
+    };
+    for (kind, checker, verb) in [
+        ("component", "ua-component", "--check"),
+        ("mes", "ua-mes", "--check"),
+        ("mapping", "ua-space", "check"),
+    ] {
+        let path = cell.folder().join(format!("{kind}.yaml"));
+        let path = path.to_str().unwrap();
+        let (code, lines) = run("ua-space", &["new", kind, "-o", path]);
+        assert_eq!(code, 0, "{kind}: {lines:?}");
+        let (code, lines) = run(checker, &[verb, path]);
+        assert_eq!(code, 0, "{kind}: {lines:?}");
+        let (code, lines) = run("ua-space", &["new", kind, "-o", path]);
+        assert_eq!(code, 74, "an existing file is kept: {lines:?}");
     }
 }
 

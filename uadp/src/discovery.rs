@@ -110,7 +110,7 @@ pub use meta_data::{
 };
 pub use probe::Probe;
 pub use probe_timer::{ProbeLimits, ProbeStep, ProbeTimer};
-pub use property::{EUInformation, EnumValueType, Range, enum_strings};
+pub use property::{EUInformation, EnumValueType, Range, enum_strings, strings};
 pub use settings::{
     DataSetOrderingType, DatagramConnectionTransport2DataType, DatagramConnectionTransportDataType,
     DatagramWriterGroupTransport2DataType, DatagramWriterGroupTransportDataType,

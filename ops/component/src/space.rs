@@ -6,13 +6,15 @@ use std::num::NonZeroU16;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use bridge_core::{CallDescription, CallField, CallRole, Offered, ValueDescription};
+use bridge_core::{CallDescription, CallField, CallRole, FieldNote, Offered, ValueDescription};
 use bridge_node::{PortEvent, Reason, now};
 use bytes::Bytes;
 use mappings::{Overflow, TopicId};
 use messages::{Leaf, Rank, TypeName};
 use program::{Method, State};
-use skills::{Builtin, Facts, Observer, Outcome, Parameters, Shown, Told, Transitioned, Value};
+use skills::{
+    Builtin, Facts, Observer, Outcome, Parameter, Parameters, Shown, Told, Transitioned, Value,
+};
 use tokio::sync::Notify;
 use tokio::time::Instant;
 use uadp::{BuiltinType, Timestamp};
@@ -186,6 +188,7 @@ impl Place {
                             fields::builtin(parameter.shape.builtin),
                         )
                     };
+                    let field = field.with_note(note(parameter));
                     if parameter.default.is_some() {
                         field.optional()
                     } else {
@@ -209,6 +212,17 @@ impl Place {
                 CallField::scalar("run", BuiltinType::UInt32),
             ],
         }
+    }
+}
+
+/// Returns the meaning of a parameter for users.
+fn note(parameter: &Parameter) -> FieldNote {
+    let default = parameter.default.as_ref().map(ToString::to_string);
+    FieldNote {
+        unit: parameter.unit.clone().unwrap_or_default(),
+        range: parameter.range,
+        default: default.filter(|text| text.len() <= LONGEST_DEFAULT),
+        about: parameter.about.clone(),
     }
 }
 
@@ -475,6 +489,8 @@ fn named(of: &[(String, Value)]) -> [Value; 2] {
 pub(crate) const MOST_IN_SPACE: usize = 654;
 /// Number of identifiers of a skill.
 const PER_SKILL: u16 = 100;
+/// The length in bytes of a default value above which it is not announced.
+const LONGEST_DEFAULT: usize = 512;
 /// Largest number of events of a skill that wait for the network, in addition to the first.
 const QUEUED_EVENTS: u16 = 63;
 /// Largest number of values of a component that wait for the run loop.

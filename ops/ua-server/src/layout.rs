@@ -238,6 +238,21 @@ fn namespace_array(
     Ok(array)
 }
 
+/// Returns the meaning of a variable. Without a description in the mapping, the description names
+/// the topic and its ROS topics.
+fn described(variable: &Variable) -> Meaning {
+    let mut meaning = variable.meaning.clone();
+    let ros = variable.ros_names();
+    let ros: Vec<String> = ros
+        .map(|(space, name)| format!("{name} in space {space}"))
+        .collect();
+    if meaning.description.is_none() && !ros.is_empty() {
+        let (topic, ros) = (variable.topic, ros.join(", "));
+        meaning.description = Some(format!("{topic}, in ROS {ros}"));
+    }
+    meaning
+}
+
 impl TopicNode {
     fn of(
         variable: &Variable,
@@ -262,7 +277,7 @@ impl TopicNode {
             fields,
         );
         let mut node = Self {
-            meaning: variable.meaning.clone(),
+            meaning: described(variable),
             sourced: variable.from.is_some() || variable.reports_alarms,
             targeted: variable.to.is_some(),
             historizing: variable.history.unwrap_or(history.values) > 0,

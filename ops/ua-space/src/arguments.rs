@@ -1,12 +1,14 @@
 //! The command line arguments.
 
+mod cell;
 mod discover;
 mod live;
 
+pub(crate) use cell::{Doctor, New, StatusArguments, Template};
 pub(crate) use discover::{Discover, Look};
 pub(crate) use live::{
     Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, Skills, SkillsVerb, Source,
-    SourceAt, SourceVerb, Target, Trace, WatchSkills,
+    SourceAt, SourceVerb, Target, Top, Trace, Types, WatchSkills,
 };
 
 use std::path::PathBuf;
@@ -122,6 +124,49 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 69 nothing was received, or an interface or group is not
     /// available, 74 the output cannot be written.
     Hz(Hz),
+    /// Measure the bandwidth of a topic
+    ///
+    /// Counts the bytes of the values, without the headers of the network.
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 nothing was received, or an interface or group is not
+    /// available, 74 the output cannot be written.
+    Bw(Hz),
+    /// Show the topics live: rates, delays, dropped samples
+    ///
+    /// Keys: q quits, s sorts by the next column, r reverses the order, / filters, arrows scroll.
+    /// Drops are those of the programs on this host that have --metrics. In a pipe a table is
+    /// printed once.
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 an interface or group is not available, 74 the output
+    /// cannot be written.
+    Top(Top),
+    /// Show the skill types of the cell with their parameters
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 no such type, or an interface or group is not available,
+    /// 74 the output cannot be written.
+    Types(Types),
+    /// Show all programs of the cell: whether they are ready, and what they wait for
+    ///
+    /// Finds the programs of this host and asks those with --metrics for their status; programs of
+    /// other hosts are known by their announcements in the group, and with their URLs as arguments
+    /// by their status.
+    ///
+    /// Exit codes: 0 all are ready, 1 a program is not ready, 64 usage, 69 no program was found,
+    /// 74 the output cannot be written.
+    Status(StatusArguments),
+    /// Look for faults of the cell and of this host, and say what to do
+    ///
+    /// Checks interfaces, multicast, sockets, firewall, ROS settings, programs, mappings, clocks,
+    /// certificates and limits of the kernel. Each finding has a code, the reason why it matters,
+    /// and a remedy. Sends one datagram per interface, which does not leave this host.
+    ///
+    /// Exit codes: 0 no errors and warnings, 1 errors or warnings, 64 usage, 74 a file cannot be
+    /// written.
+    Doctor(Doctor),
+    /// Write a commented starting file: a component, a MES or a mapping
+    ///
+    /// Exit codes: 0 done, 64 usage, 74 the file exists or cannot be written.
+    New(New),
     /// List the skills of all components with their states; show, start or watch skills
     ///
     /// Exit codes: 0 done, and the run succeeded, 1 refused, or the run did not succeed, 64 usage,

@@ -140,8 +140,8 @@ impl Place {
             "SKILL" => Some(Names::Skills),
             "COMPONENT|SKILL" => Some(Names::Either),
             "TOPIC|NAME" if self.command.get_name() == "start" => Some(Names::Skills),
-            "TOPIC|NAME" => Some(Names::Calls),
-            "TOPIC" => Some(Names::Topics),
+            "TOPIC|NAME" if self.command.get_name() == "call" => Some(Names::Calls),
+            "TOPIC|NAME" => Some(Names::Topics),
             _ => None,
         }
     }
@@ -157,7 +157,8 @@ impl Names {
             components,
             mut skills,
             calls,
-            topics,
+            mut topics,
+            names,
         } = heard;
         match self {
             Self::Skills => skills,
@@ -171,7 +172,10 @@ impl Names {
                 skills.extend(calls.into_iter().filter(|name| !name.ends_with(".Start")));
                 skills
             }
-            Self::Topics => topics,
+            Self::Topics => {
+                topics.extend(names);
+                topics
+            }
         }
     }
 }
@@ -274,6 +278,7 @@ mod tests {
                 "gripper.Grasp.Halt".to_owned(),
             ],
             topics: vec!["ua_0_7_101".to_owned()],
+            names: vec!["JointStates".to_owned(), "/joint_states".to_owned()],
         };
         assert_eq!(
             Names::Calls.of(heard, "g"),

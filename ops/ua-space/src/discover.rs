@@ -43,7 +43,7 @@ const HEAD: [&str; 7] = [
 ];
 
 fn table(entries: &[Entry]) -> Table {
-    let mut table = Table::new(HEAD.map(str::to_owned));
+    let mut table = Table::new(HEAD.map(str::to_owned)).yielding([6, 5, 4, 3, 2]);
     let dash = |text: String| match text.is_empty() {
         true => "-".to_owned(),
         false => text,

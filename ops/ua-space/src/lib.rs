@@ -4,6 +4,7 @@ mod actions;
 mod arguments;
 mod ask;
 mod capture;
+mod cell;
 mod check;
 mod completion;
 mod decode;
@@ -26,6 +27,7 @@ mod live;
 mod make_keys;
 mod messages;
 mod metadata;
+mod new;
 mod node_ids;
 mod packet;
 mod page;
@@ -79,6 +81,12 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Info(arguments) => live::info(arguments),
         Verb::Echo(arguments) => live::echo(arguments),
         Verb::Hz(arguments) => live::hz(arguments),
+        Verb::Bw(arguments) => live::bandwidth(arguments),
+        Verb::Top(arguments) => live::top(arguments),
+        Verb::Types(arguments) => live::types(arguments),
+        Verb::Status(arguments) => cell::status(arguments),
+        Verb::Doctor(arguments) => cell::doctor(arguments),
+        Verb::New(arguments) => new::new(arguments),
         Verb::Skills(arguments) => live::skills(arguments),
         Verb::Call(arguments) => live::call(arguments),
         Verb::Trace(arguments) => live::trace(arguments),

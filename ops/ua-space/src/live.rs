@@ -2,28 +2,35 @@
 
 mod all;
 mod application;
+mod bandwidth;
 mod book;
 mod call;
 mod described;
 mod echo;
 mod list;
+mod names;
 mod parameters;
 mod plain;
 mod prober;
 mod run;
 mod sealing;
+mod seen;
 mod skills;
 mod structure;
 mod text;
+mod top;
 mod trace;
 
 pub(crate) use all::list;
 pub(crate) use application::Application;
+pub(crate) use bandwidth::bandwidth;
 pub(crate) use call::call;
 pub(crate) use echo::{echo, hz};
 pub(crate) use list::{info, json};
-pub(crate) use skills::{HeardNames, heard_names, skills};
-pub(crate) use text::{Table, harmless, is_coloured};
+pub(crate) use seen::{Timing, TopicSeen, listened};
+pub(crate) use skills::{HeardNames, heard_names, skills, types};
+pub(crate) use text::{Table, harmless, is_coloured, wrapped};
+pub(crate) use top::{Sort, top};
 pub(crate) use trace::trace;
 
 use std::collections::{BTreeMap, BTreeSet};

@@ -6,6 +6,8 @@ pub(crate) mod opcua;
 pub(crate) mod ros1;
 pub(crate) mod ros2;
 
+pub(crate) use ros1::master_uri;
+
 use std::fmt::Display;
 
 use mappings::{LiveSpace, NodeIdText, SpaceId};

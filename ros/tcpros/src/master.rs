@@ -34,6 +34,19 @@ impl Graph {
     pub async fn of_master(uri: &str, caller_id: &str) -> Result<Self, MasterError> {
         Master::at(uri, caller_id)?.graph().await
     }
+
+    /// Returns the URI that a node registered with the master at `uri`; `None` if the node is
+    /// unknown. Takes at most 3 s.
+    ///
+    /// # Errors
+    /// See [`of_master`](Self::of_master).
+    pub async fn node_uri(
+        uri: &str,
+        caller_id: &str,
+        node: &str,
+    ) -> Result<Option<String>, MasterError> {
+        Master::at(uri, caller_id)?.lookup_node(node).await
+    }
 }
 
 /// A master, called with the name of a node.

@@ -95,7 +95,25 @@ pub struct CallField {
     /// The fields of a message in this field, if the executor announces them. `None` for calls of
     /// this program.
     pub structure: Option<Arc<CallStructure>>,
+    /// The meaning for users. It is announced, and not read from the announcements of others.
+    pub note: Option<Box<FieldNote>>,
 }
+
+/// The meaning of a field of a call for users.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct FieldNote {
+    /// The symbol of the unit; empty without a unit.
+    pub unit: String,
+    /// The lowest and the highest value.
+    pub range: Option<(f64, f64)>,
+    /// The default value as text.
+    pub default: Option<String>,
+    /// The description; may be empty.
+    pub about: String,
+}
+
+// The bounds of a range are finite, because the parsers of skill types and mappings refuse others.
+impl Eq for FieldNote {}
 
 /// A message in a field of a call, as defined by the schema of its ActionMetaData.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -270,6 +288,7 @@ impl CallField {
             rank: leaf.rank,
             optional: false,
             structure: None,
+            note: None,
         }
     }
 
@@ -282,6 +301,7 @@ impl CallField {
             rank: Rank::Scalar,
             optional: false,
             structure: None,
+            note: None,
         }
     }
 
@@ -291,6 +311,15 @@ impl CallField {
         Self {
             rank: Rank::Array { fixed: None },
             ..Self::scalar(name, builtin)
+        }
+    }
+
+    /// Sets the meaning for users.
+    #[must_use]
+    pub fn with_note(self, note: FieldNote) -> Self {
+        Self {
+            note: Some(Box::new(note)),
+            ..self
         }
     }
 

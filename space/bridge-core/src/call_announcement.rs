@@ -1,25 +1,28 @@
 //! The arguments and results of a call as ActionMetaData (OPC 10000-14, 6.2.3.10 and 7.2.4.6.11).
 //!
 //! As for values, the name starts with the topic, because an announcement has no WriterGroupId. A
-//! field of the request that has a default value has the Property `Optional`.
+//! field of the request that has a default value has the Property `Optional`. Fields with a meaning
+//! for users have the Properties `EngineeringUnits`, `EURange` and `Default` (a text).
 
 use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
-use mappings::TopicId;
+use mappings::{TopicId, Unit};
 use messages::{MessageType, Rank};
 use uadp::discovery::{
     ActionMetaData, ActionTargetDataType, Announced, Announcement, ConfigurationVersion,
-    DataSetMetaDataType, DataTypeSchemaHeader, FieldMetaData, KeyValuePair, List,
-    StructureDescription, StructureType,
+    DataSetMetaDataType, DataTypeSchemaHeader, EUInformation, FieldMetaData, KeyValuePair, List,
+    Range, Settings as _, StructureDescription, StructureType,
 };
 use uadp::{
     Array, BuiltinType, EncodeError, Identifier, NodeId, PublisherId, QualifiedName, Scalar,
     SecurityHeader, Timestamp, Variant,
 };
 
-use crate::call::{ActionFamily, CallDescription, CallField, CallRole, CallStructure, join_name};
+use crate::call::{
+    ActionFamily, CallDescription, CallField, CallRole, CallStructure, FieldNote, join_name,
+};
 use crate::description::{
     MAX_ANNOUNCEMENT, MAX_NAME, data_type, field_id, list, read_rank, sizes, text, value_rank,
     version_time, with_structures,
@@ -214,6 +217,40 @@ impl<'s> FieldList<'s> {
     }
 }
 
+/// Returns the Properties with unit, range and default of a field (OPC 10000-8, 5.3.2).
+fn note_properties<'b>(
+    note: &'b FieldNote,
+    [unit_buffer, range_buffer]: &'b mut [Vec<u8>; 2],
+) -> Result<Vec<KeyValuePair<'b>>, EncodeError> {
+    let mut found = Vec::new();
+    if !note.unit.is_empty() {
+        let known = Unit::find(&note.unit);
+        let information = EUInformation {
+            namespace_uri: known.map(|_| Unit::NAMESPACE),
+            // OPC 10000-8, 5.6.4.3: -1 for a unit without a number.
+            unit_id: known.map_or(-1, Unit::id),
+            display_name: text(&note.unit),
+            description: text(known.map_or("", |unit| unit.name)),
+        };
+        let object = information.write_object(unit_buffer)?;
+        let value = Variant::Scalar(Scalar::ExtensionObject(object));
+        let key = named("EngineeringUnits");
+        found.push(KeyValuePair { key, value });
+    }
+    if let Some((low, high)) = note.range {
+        let object = Range { low, high }.write_object(range_buffer)?;
+        let value = Variant::Scalar(Scalar::ExtensionObject(object));
+        let key = named("EURange");
+        found.push(KeyValuePair { key, value });
+    }
+    if let Some(default) = &note.default {
+        let value = Variant::Scalar(Scalar::String(Some(default)));
+        let key = named("Default");
+        found.push(KeyValuePair { key, value });
+    }
+    Ok(found)
+}
+
 impl Side<'_> {
     /// Calls `then` with the metadata of the request or response.
     fn with<T>(
@@ -228,15 +265,18 @@ impl Side<'_> {
             value: Variant::Scalar(Scalar::Boolean(true)),
         };
         let role = self.fields.role()?;
-        let of_field = |index, field: &CallField| {
+        let mut buffers = vec![<[Vec<u8>; 2]>::default(); self.fields.fields.len()];
+        let mut properties: Vec<Vec<KeyValuePair<'_>>> = Vec::new();
+        let fields = self.fields.fields.iter().zip(&mut buffers).enumerate();
+        for (index, (field, buffers)) in fields {
             let role = role.filter(|_| index == 0);
             let optional = field.optional.then_some(optional);
-            role.into_iter().chain(optional).collect::<Vec<_>>()
-        };
-        let fields = self.fields.fields.iter().enumerate();
-        let properties: Vec<Vec<KeyValuePair<'_>>> = fields
-            .map(|(index, field)| of_field(index, field))
-            .collect();
+            let mut own: Vec<KeyValuePair<'_>> = role.into_iter().chain(optional).collect();
+            if let Some(note) = &field.note {
+                own.extend(note_properties(note, buffers)?);
+            }
+            properties.push(own);
+        }
         let fields = self.fields.fields.iter().zip(&self.fields.sizes);
         let fields: Vec<FieldMetaData<'_>> = fields
             .zip(&properties)
@@ -244,8 +284,10 @@ impl Side<'_> {
             .map(|(index, ((field, sizes), properties))| {
                 let structure = field.builtin == BuiltinType::ExtensionObject;
                 let of = self.of.filter(|_| structure);
+                let about = field.note.as_ref().map_or("", |note| &note.about);
                 FieldMetaData {
                     name: Some(&field.name),
+                    description: text(about),
                     built_in_type: field.builtin.id(),
                     data_type: data_type(
                         field.builtin,
@@ -380,6 +422,7 @@ fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, Str
             structure: find(&structures, field.data_type)
                 .filter(|_| is_structure(builtin))
                 .map(|(structure, _)| Arc::clone(structure)),
+            note: None,
         })
     });
     fields.collect()
@@ -461,6 +504,7 @@ fn read_structure(
             rank,
             optional: false,
             structure,
+            note: None,
         })
     });
     let name = name.to_owned();

@@ -5,8 +5,9 @@
 //! DataSetWriterId. The description is the name of the ROS type of the message that the fields
 //! form. It ends with ` as bytes` if the field is a ByteString with the whole message. The type
 //! name is missing if the fields do not form a message: a single value of a message, or values that
-//! were converted. A local side with fields as payload may add a display name after the topic name,
-//! and a description after `; `.
+//! were converted. The display name follows after the topic name: the name in the mapping, or the
+//! name from a local side with fields as payload, which may also add a description after `; `. The
+//! Property [`ROS_TOPICS`] of the first field lists the ROS topics of the mapping.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
@@ -17,7 +18,7 @@ use messages::{Leaf, MemberKind, MessageType, Rank, Selected, Selection, TypeNam
 use uadp::discovery::{
     Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, DataTypeSchemaHeader,
     EUInformation, EnumValueType, FieldMetaData, KeyValuePair, List, Range, Settings,
-    StructureDefinition, StructureDescription, StructureField, enum_strings,
+    StructureDefinition, StructureDescription, StructureField, enum_strings, strings,
 };
 use uadp::{
     BuiltinType, EncodeError, Guid, LocalizedText, NodeId, PublisherId, QualifiedName, Scalar,
@@ -210,13 +211,15 @@ impl Description {
             Some(before) => before.version.changed(version_time(utc)),
             None => ConfigurationVersion::default().changed(version_time(utc)),
         };
-        let (datagram, body_at) = source.encode(version)?;
+        let (mut datagram, body_at) = source.encode(version)?;
         if datagram.len() > MAX_ANNOUNCEMENT {
             return Err(EncodeError::TooBig {
                 what: "DataSetMetaData",
                 len: datagram.len(),
             });
         }
+        // There may be thousands of announcements, and each is stored for as long as its topic.
+        datagram.shrink_to_fit();
         Ok(Self {
             datagram,
             body_at,
@@ -252,13 +255,16 @@ impl Source<'_> {
     fn encode(&self, version: ConfigurationVersion) -> Result<(Vec<u8>, usize), EncodeError> {
         let (_, namespace, _) = self.topic.triple();
         let description = self.description();
-        let called = self.said.map_or("", |said| &said.name);
         let named: Vec<FieldText> = self.leaves.iter().map(|leaf| self.names(leaf)).collect();
         let mut buffers = <[Vec<u8>; 3]>::default();
-        let properties = match (self.leaves, self.variable) {
+        let mut properties = match (self.leaves, self.variable) {
             ([_], Some(variable)) => properties(&variable.meaning, &mut buffers)?,
             _ => Vec::new(),
         };
+        let mut topics_buffer = Vec::new();
+        if let Some(variable) = self.variable {
+            properties.extend(ros_topics(variable, &mut topics_buffer)?);
+        }
         let fields: Vec<FieldMetaData<'_>> = self
             .leaves
             .iter()
@@ -266,7 +272,7 @@ impl Source<'_> {
             .enumerate()
             .map(|(index, (leaf, text))| self.field(index, leaf, (text, &properties)))
             .collect();
-        let name = join_name(self.topic, called);
+        let name = join_name(self.topic, self.name());
         let plain = DataSetMetaDataType {
             name: Some(&name),
             description: text(&description),
@@ -308,6 +314,15 @@ impl Source<'_> {
         announcement.encode_body(&mut body)?;
         let body_at = datagram.len().saturating_sub(body.len());
         Ok((datagram, body_at))
+    }
+
+    /// Returns the display name: of the local side, or of the mapping. Readers refuse an
+    /// announcement with a longer name than [`MAX_NAME`].
+    fn name(&self) -> &str {
+        let mapped = || self.variable.map(|variable| variable.name.as_str());
+        let said = self.said.map(|said| said.name.as_str());
+        let name = said.or_else(mapped).unwrap_or_default();
+        if name.len() > MAX_NAME { "" } else { name }
     }
 
     /// Returns the path in the message to which the fields belong; empty for the whole message.
@@ -389,8 +404,7 @@ impl Source<'_> {
             value_rank: value_rank(leaf.rank),
             array_dimensions: list(&said.sizes),
             data_set_field_id: field_id(self.topic, index, &said.name),
-            // Empty except for a single value.
-            properties: list(properties),
+            properties: list(if index == 0 { properties } else { &[] }),
             ..FieldMetaData::default()
         }
     }
@@ -539,6 +553,28 @@ fn properties<'b>(
     Ok(found)
 }
 
+/// Returns the Property with the ROS topics and services of a value; `None` if there are none.
+fn ros_topics<'b>(
+    variable: &Variable,
+    buffer: &'b mut Vec<u8>,
+) -> Result<Option<KeyValuePair<'b>>, EncodeError> {
+    let names = variable
+        .ros_names()
+        .filter(|(_, name)| name.len() <= MAX_NAME)
+        .map(|(space, name)| format!("{space} {name}"));
+    let names: Vec<String> = names.collect();
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    if names.is_empty() {
+        return Ok(None);
+    }
+    let key = QualifiedName {
+        namespace: 0,
+        name: Some(ROS_TOPICS),
+    };
+    let value = strings(&names, buffer)?;
+    Ok(Some(KeyValuePair { key, value }))
+}
+
 /// Returns the types of the messages in arrays and of the messages nested in them, without
 /// duplicates.
 fn structures<'m>(message_type: &'m MessageType, leaves: &[Leaf]) -> Vec<messages::Structure<'m>> {
@@ -673,6 +709,9 @@ pub(crate) fn version_time(utc: Timestamp) -> u32 {
 const STRUCTURE: NodeId<'static> = NodeId::numeric(0, 22);
 /// Seconds from 1970 to 2000.
 const UNIX_2000: i128 = 946_684_800;
+/// The Property of the first field of a DataSet with the ROS topics and services of the value: an
+/// array of texts, each with the number of a space and a name, such as `1 /joint_states`.
+pub const ROS_TOPICS: &str = "RosTopics";
 /// The separator between the type and the description.
 const ABOUT: &str = "; ";
 /// The maximum accepted length in bytes of the description after the separator.

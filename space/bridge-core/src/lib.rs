@@ -47,12 +47,12 @@ mod writer;
 pub use application::{Application, Endpoint};
 pub use call::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription,
-    CallField, CallMap, CallRole, CallStructure, Executed, Execution, Offered, OfferedType,
-    ValueDescription, ValueNote, split_name,
+    CallField, CallMap, CallRole, CallStructure, Executed, Execution, FieldNote, Offered,
+    OfferedType, ValueDescription, ValueNote, split_name,
 };
 pub use confirm::{Arrival, Handover};
 pub use counters::{Counters, Reason, Verdict};
-pub use description::Described;
+pub use description::{Described, ROS_TOPICS};
 pub use fields::{decode_fields, encode_fields};
 pub use guard::{GroupState, Guard, KeyDelivery, Unopened, policy_of};
 pub use hops::{Delays, Hop, Hops};

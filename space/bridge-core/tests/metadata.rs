@@ -491,6 +491,48 @@ fn two_topics_with_one_number_in_two_namespaces_are_told_apart() {
 }
 
 #[test]
+fn a_mapped_topic_is_announced_with_its_name_and_its_ros_topics() {
+    let text = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:test}\nvariables:\n  - {node: ns=2;i=10, name: Arm.Joint States, \
+                origin: 1, ros: [{space: 1, topic: /joint_states, type: geometry_msgs/Twist}, \
+                {space: 2, topic: /arm/joint_states, type: geometry_msgs/Twist}]}\n";
+    let (mut bridge, mut now) = (Bridge::new(1, text), clock());
+    bridge.bind("ua_1_2_10", "geometry_msgs/Twist", &Selection::Whole, now);
+    let sent = bridge.sent_within(SECOND, &mut now);
+    let mut seen = 0;
+    each_meta_data(&sent, |_, meta_data| {
+        assert_eq!(meta_data.name, Some("ua_1_2_10 Arm.Joint States"));
+        let fields: Vec<_> = meta_data.fields.iter().collect();
+        let keys = |index: usize| -> Vec<Option<&str>> {
+            let properties = fields[index].properties.iter();
+            properties.map(|property| property.key.name).collect()
+        };
+        assert_eq!(keys(0), [Some(bridge_core::ROS_TOPICS)]);
+        assert!(keys(1).is_empty());
+        let uadp::Variant::Array(topics) = fields[0].properties.get(0).unwrap().value else {
+            panic!("an array")
+        };
+        let topics: Vec<_> = topics.iter().collect();
+        let text = |text| uadp::Scalar::String(Some(text));
+        assert_eq!(
+            topics,
+            [text("1 /joint_states"), text("2 /arm/joint_states")]
+        );
+        seen += 1;
+    });
+    assert_eq!(seen, 1);
+    // A reader without a mapping knows the name.
+    let mut reader = Bridge::new(2, "");
+    bridge.say("ua_1_2_10", &TWIST, now);
+    let values = bridge.sent_within(SECOND / 2, &mut now);
+    reader.hear(&bridge, &sent, now);
+    reader.hear(&bridge, &values, now);
+    assert_eq!(reader.refused(), 0);
+    let told = reader.told(now);
+    let described = told.iter().find_map(|(_, described)| described.as_ref());
+    assert_eq!(described.unwrap().name, "Arm.Joint States");
+}
+
+#[test]
 fn what_is_written_in_opc_ua_is_announced_as_the_mapping_says_it() {
     let mut now = clock();
     let text = |unit: &str| {
@@ -523,7 +565,7 @@ fn what_is_written_in_opc_ua_is_announced_as_the_mapping_says_it() {
     assert_eq!(said[0].1.as_deref(), Some("geometry_msgs/Twist"));
     assert_eq!(said[0].2.len(), 6);
     assert_eq!(said[0].2[5], ("angular.z".to_owned(), 11, -1, 0));
-    assert_eq!(said[1], (2, None, vec![("Level".to_owned(), 11, -1, 1)]));
+    assert_eq!(said[1], (2, None, vec![("Level".to_owned(), 11, -1, 2)]));
     assert_eq!(said[2], (3, None, vec![("Names".to_owned(), 12, 1, 0)]));
 
     // A bridge without a mapping knows the type before the first value.

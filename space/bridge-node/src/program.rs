@@ -306,6 +306,7 @@ async fn prepare<P: Program>(
     router.introduce(application, now());
     Ok(Shell {
         program: P::NAME,
+        started: now().monotonic,
         library: P::library(),
         own,
         router,

@@ -9,7 +9,7 @@ use std::io;
 use std::pin::pin;
 use std::sync::Arc;
 use std::task::Poll;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_core::{Heard, Notice, Output, Owned, Reason, Router};
 use bytes::Bytes;
@@ -35,6 +35,8 @@ use crate::status::{Interfaces, Readiness, Status};
 /// The run loop of one space, with its Router, port and socket, and the requests for the status.
 pub(crate) struct Shell<P> {
     pub(crate) program: &'static str,
+    /// The start of the program.
+    pub(crate) started: Instant,
     /// The library of the port, for the status.
     pub(crate) library: Option<&'static str>,
     pub(crate) own: SpaceId,
@@ -272,6 +274,7 @@ impl<P: Port> Shell<P> {
             },
         )
         .with_library(self.library)
+        .with_uptime(now().monotonic.saturating_duration_since(self.started))
         .with_links(self.port.links())
         .with_certificate(self.port.certificate())
         .with_pending(self.port.pending())
@@ -415,9 +418,13 @@ impl<P: Port> Shell<P> {
                 message_type,
                 selection,
             } => match self.router.bind(topic, &message_type, &selection, now()) {
-                Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
+                Ok(()) => {
+                    let name = self.name_of(topic);
+                    info!(%topic, message_type = %message_type.name(), name, "bound");
+                }
                 Err(error) => {
-                    warn!(%topic, %error, "the topic cannot cross");
+                    let name = self.name_of(topic);
+                    warn!(%topic, %error, name, "the topic cannot cross");
                     // Values would be misread with the previous binding.
                     self.router.unbind(topic, now());
                 }
@@ -499,14 +506,24 @@ impl<P: Port> Shell<P> {
                     self.handed(topic, Some(instance));
                 }
                 Output::CommanderLost { topic } => {
-                    warn!(%topic, "commander lost, `on_loss` is published");
+                    let name = self.name_of(topic);
+                    warn!(%topic, name, "commander lost, `on_loss` is published");
                 }
-                Output::Notice(notice) => tell(&notice),
+                Output::Notice(notice) => {
+                    let name = notice.topic.and_then(|topic| self.name_of(topic));
+                    tell(&notice, name);
+                }
                 Output::KeysWanted { group } => self.keys.want(&group),
                 other => self.call_output(other),
             }
         }
         true
+    }
+
+    /// Returns the name of a topic in the mapping.
+    fn name_of(&self, topic: TopicId) -> Option<&str> {
+        let variable = self.router.mapping().variable(topic);
+        variable.map(|variable| variable.name.as_str())
     }
 
     fn silent(&mut self, topic: TopicId, silent: bool, dropped: Option<Reason>) {
@@ -611,7 +628,7 @@ fn not_sent(error: SendError) -> Reason {
     }
 }
 
-fn tell(notice: &Notice) {
+fn tell(notice: &Notice, name: Option<&str>) {
     let Notice {
         topic,
         from,
@@ -621,7 +638,7 @@ fn tell(notice: &Notice) {
     } = notice;
     let topic = topic.map(tracing::field::display);
     let from = from.map(tracing::field::display);
-    warn!(topic, from, reason = %reason, total, "dropped: {detail}");
+    warn!(topic, from, reason = %reason, total, name, "dropped: {detail}");
 }
 
 /// The maximal number of outputs carried out before the other branches are polled. If sending is

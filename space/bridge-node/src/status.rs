@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::time::Duration;
 
 use bridge_core::{CallCounters, Counters, Delays, Hop, Reason, Router};
-use mappings::SpaceId;
+use mappings::{SpaceId, Variable};
 use serde::Serialize;
 
 use crate::mapping_file::About;
@@ -17,6 +18,8 @@ pub(crate) struct Status {
     program: &'static str,
     /// The version, with the commit of a packaged build.
     version: &'static str,
+    /// Seconds since the start of the program.
+    uptime_s: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     library: Option<&'static str>,
     space: u8,
@@ -94,6 +97,12 @@ struct GroupStatus {
 
 #[derive(Debug, Clone, Serialize)]
 struct TopicStatus {
+    /// Name in the mapping.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<String>,
+    /// ROS topics and services of the value, each with its space.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    ros_topics: Vec<RosTopic>,
     sent: u64,
     delivered: u64,
     repeated: u64,
@@ -106,6 +115,12 @@ struct TopicStatus {
     /// itself. They are not drops.
     looped: u64,
     dropped: BTreeMap<&'static str, u64>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct RosTopic {
+    space: u8,
+    topic: String,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -141,7 +156,13 @@ impl Status {
     ) -> Self {
         let topics = router
             .topics()
-            .map(|(topic, counters)| (topic.to_string(), counters.into()))
+            .map(|(topic, counters)| {
+                let mut status = TopicStatus::from(counters);
+                if let Some(variable) = router.mapping().variable(topic) {
+                    status.take_names(variable);
+                }
+                (topic.to_string(), status)
+            })
             .collect();
         let groups = router.groups().map(|state| {
             let status = GroupStatus {
@@ -167,6 +188,7 @@ impl Status {
         Self {
             program,
             version: build_info::version(),
+            uptime_s: 0,
             library: None,
             space: space.get(),
             readiness,
@@ -191,6 +213,11 @@ impl Status {
         self
     }
 
+    pub(crate) const fn with_uptime(mut self, uptime: Duration) -> Self {
+        self.uptime_s = uptime.as_secs();
+        self
+    }
+
     pub(crate) fn with_links(mut self, links: Vec<LinkState>) -> Self {
         self.servers = links;
         self
@@ -204,6 +231,15 @@ impl Status {
     pub(crate) fn with_pending(mut self, pending: Vec<String>) -> Self {
         self.cancellations_pending = pending;
         self
+    }
+
+    /// Returns a figure for Prometheus with the names of each topic that the mapping names.
+    fn topic_names(&self, own: &str) -> String {
+        let named = self.topics.iter().filter_map(|(topic, status)| {
+            let labels = status.named(topic)?;
+            Some(format!("ua_topic_info{{{own},{labels}}} 1\n"))
+        });
+        named.collect()
     }
 
     /// Returns the number of topics, and the numbers of samples sent, delivered and dropped.
@@ -333,6 +369,7 @@ impl Told for Status {
         for (hop, delays) in &self.hops {
             delays.figures(&format!("{own},hop=\"{hop}\""), &mut line);
         }
+        text.push_str(&self.topic_names(&own));
         text
     }
 }
@@ -398,9 +435,33 @@ impl CallStatus {
     }
 }
 
+impl TopicStatus {
+    fn take_names(&mut self, variable: &Variable) {
+        self.name = Some(variable.name.clone());
+        let names = variable.ros_names().map(|(space, topic)| RosTopic {
+            space: space.get(),
+            topic: topic.to_owned(),
+        });
+        self.ros_topics = names.collect();
+    }
+
+    /// Returns the labels of a topic with its names; `None` without a name.
+    fn named(&self, topic: &str) -> Option<String> {
+        let name = self.name.as_deref()?;
+        let of = |ros: &RosTopic| format!("{} {}", ros.space, ros.topic);
+        let ros: Vec<String> = self.ros_topics.iter().map(of).collect();
+        let (name, ros) = (escaped(name), escaped(&ros.join(", ")));
+        Some(format!(
+            "topic=\"{topic}\",name=\"{name}\",ros_topics=\"{ros}\""
+        ))
+    }
+}
+
 impl From<&Counters> for TopicStatus {
     fn from(counters: &Counters) -> Self {
         Self {
+            name: None,
+            ros_topics: Vec::new(),
             sent: counters.sent,
             delivered: counters.delivered,
             repeated: counters.repeated,
@@ -497,6 +558,42 @@ mod tests {
     }
 
     #[test]
+    fn the_names_of_a_mapped_topic_are_in_both_pages() {
+        let text = "spaces: [{id: 1}]\nnamespaces: {2: urn:test}\nvariables:\n  - {node: ns=2;i=10, name: Arm \"left\", origin: 1, \
+                    ros: {space: 1, topic: /joint_states, type: std_msgs/Int32}}\n";
+        let mapping = mappings::Mapping::from_yaml(text, "cell.yaml")
+            .mapping
+            .unwrap();
+        let settings = Settings {
+            own: SpaceId::ROS1,
+            local: Local::Fields,
+            source: None,
+        };
+        let mut router = Router::new(settings, std::sync::Arc::new(mapping));
+        let topic = "ua_1_2_10".parse().unwrap();
+        router.set_live(topic, true, crate::clock::now());
+        let ready = Readiness {
+            not_ready: Vec::new(),
+            waiting_for: Vec::new(),
+            interfaces: Interfaces {
+                pubsub: 1,
+                local: None,
+            },
+        };
+        let about = About::default();
+        let status = Status::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
+        let line = "ua_topic_info{program=\"bridge\",space=\"1\",topic=\"ua_1_2_10\",\
+                    name=\"Arm \\\"left\\\"\",ros_topics=\"1 /joint_states\"} 1\n";
+        let text = status.prometheus();
+        assert!(text.contains(line), "{text}");
+        let json: serde_json::Value = serde_json::from_str(&status.json()).unwrap();
+        let topic = &json["topics"]["ua_1_2_10"];
+        assert_eq!(topic["name"], "Arm \"left\"");
+        let ros = serde_json::json!([{"space": 1, "topic": "/joint_states"}]);
+        assert_eq!(topic["ros_topics"], ros);
+    }
+
+    #[test]
     fn what_became_of_calls_stands_in_both_pages() {
         let settings = Settings {
             own: SpaceId::ROS1,
@@ -505,7 +602,7 @@ mod tests {
         };
         let mut router = Router::new(settings, std::sync::Arc::default());
         let call = "ua_0_7_105".parse().unwrap();
-        let timeout = std::time::Duration::from_secs(1);
+        let timeout = Duration::from_secs(1);
         router.ask(AskId(1), (call, &[0, 0]), timeout, crate::clock::now());
         let ready = Readiness {
             not_ready: Vec::new(),

@@ -83,6 +83,18 @@ pub fn enum_strings<'b>(
     elements(BuiltinType::LocalizedText, names.len(), buffer)
 }
 
+/// Returns an array of Strings in `buffer`, as the value of a Property.
+///
+/// # Errors
+/// [`EncodeError::TooBig`] for a text that exceeds its length field.
+pub fn strings<'b>(texts: &[&str], buffer: &'b mut Vec<u8>) -> Result<Variant<'b>, EncodeError> {
+    buffer.clear();
+    for text in texts {
+        Scalar::String(Some(text)).write::<false>(buffer)?;
+    }
+    elements(BuiltinType::String, texts.len(), buffer)
+}
+
 fn elements(element: BuiltinType, count: usize, bytes: &[u8]) -> Result<Variant<'_>, EncodeError> {
     // The bytes were written above, so they are valid.
     let array: Result<_, DecodeError> = Array::new(element, count, bytes);

@@ -7,6 +7,8 @@ use std::str::FromStr;
 use clap::{Args, Subcommand};
 use mappings::{SpaceId, TopicId};
 
+use crate::live::Sort;
+
 /// Where the space is.
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct Group {
@@ -45,9 +47,9 @@ pub(crate) struct List {
 
 #[derive(Debug, Args)]
 pub(crate) struct Info {
-    /// The topic, as ua_1_2_10
-    #[arg(value_name = "TOPIC", value_parser = topic)]
-    pub(crate) topic: TopicId,
+    /// The topic, as ua_1_2_10, or its name, as JointStates or /joint_states
+    #[arg(value_name = "TOPIC|NAME")]
+    pub(crate) target: Target,
     /// Time to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
@@ -60,9 +62,9 @@ pub(crate) struct Info {
 
 #[derive(Debug, Args)]
 pub(crate) struct Echo {
-    /// The topic, as ua_1_2_10
-    #[arg(value_name = "TOPIC", value_parser = topic)]
-    pub(crate) topic: TopicId,
+    /// The topic, as ua_1_2_10, or its name, as JointStates or /joint_states
+    #[arg(value_name = "TOPIC|NAME")]
+    pub(crate) target: Target,
     /// End after this number of values
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) count: Option<u64>,
@@ -78,9 +80,9 @@ pub(crate) struct Echo {
 
 #[derive(Debug, Args)]
 pub(crate) struct Hz {
-    /// The topic, as ua_1_2_10
-    #[arg(value_name = "TOPIC", value_parser = topic)]
-    pub(crate) topic: TopicId,
+    /// The topic, as ua_1_2_10, or its name, as JointStates or /joint_states
+    #[arg(value_name = "TOPIC|NAME")]
+    pub(crate) target: Target,
     /// Largest number of values in a measurement
     #[arg(long, value_name = "N", default_value_t = 10_000, value_parser = window)]
     pub(crate) window: usize,
@@ -88,6 +90,36 @@ pub(crate) struct Hz {
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) seconds: Option<f64>,
     /// Print a JSON object per second
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Top {
+    /// The order of the topics
+    #[arg(long, value_name = "COLUMN", value_enum, default_value_t)]
+    pub(crate) sort: Sort,
+    /// Only topics with this text in their topic, name, quality or type
+    #[arg(long, value_name = "TEXT")]
+    pub(crate) filter: Option<String>,
+    /// End after this time; in a pipe the time before the table. Without it: at q, or 3 s in a pipe
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub(crate) seconds: Option<f64>,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Types {
+    /// Only this type, as GraspSkillType or Grasp
+    #[arg(value_name = "TYPE")]
+    pub(crate) name: Option<String>,
+    /// Time to listen
+    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
+    pub(crate) seconds: f64,
+    /// Print a JSON array
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]
@@ -297,7 +329,7 @@ pub(crate) struct SourceAt {
     pub(crate) password: Option<String>,
 }
 
-/// The target of a call.
+/// A topic or call, by its identifiers or by a name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Target {
     Topic(TopicId),
@@ -310,7 +342,10 @@ impl FromStr for Target {
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         match topic(text) {
             Ok(topic) => Ok(Self::Topic(topic)),
-            Err(_) if text.is_empty() => Err("a topic as ua_0_7_105, or a name as gripper.Grasp"),
+            Err(_) if text.is_empty() => {
+                Err("a topic as ua_0_7_105, or a name as gripper.Grasp or /joint_states")
+            }
+            Err(wrong) if looks_like_topic(text) => Err(wrong),
             Err(_) => Ok(Self::Name(text.to_owned())),
         }
     }
@@ -332,7 +367,14 @@ fn topic(text: &str) -> Result<TopicId, &'static str> {
         .map_err(|_| "a topic of the space is ua_<space>_<namespace>_<identifier>, as ua_1_2_10")
 }
 
-pub(super) fn seconds(text: &str) -> Result<f64, &'static str> {
+/// Returns true for `ua_` and numbers, which is a misspelt topic and no name.
+fn looks_like_topic(text: &str) -> bool {
+    let name = text.strip_prefix('/').unwrap_or(text);
+    let numbers = name.strip_prefix("ua_");
+    numbers.is_some_and(|rest| rest.chars().all(|c| c.is_ascii_digit() || c == '_'))
+}
+
+pub(in crate::arguments) fn seconds(text: &str) -> Result<f64, &'static str> {
     let seconds = seconds_or_none(text)?;
     (seconds > 0.0).then_some(seconds).ok_or(A_TIME)
 }

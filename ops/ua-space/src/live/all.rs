@@ -233,7 +233,7 @@ fn table_of_programs(programs: &[&Entry]) -> Table {
         "CAPABILITIES",
         "URI",
     ];
-    let mut table = Table::new(head.map(str::to_owned));
+    let mut table = Table::new(head.map(str::to_owned)).yielding([6, 5, 4, 2]);
     for one in programs {
         let shown = one.shown();
         let space = one.space.map(|space| space.to_string());

@@ -9,8 +9,8 @@ use mappings::TopicId;
 use uadp::action::{ActionDialect, ActionKind, ActionMessage};
 use uadp::discovery::{Announced, Announcement};
 use uadp::{
-    DataSetMessage, DecodeError, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageType,
-    PublisherId, Reassembler, ReassemblyLimits,
+    DataSetMessage, DecodeError, FieldEncoding, MessageKind, NetworkHeader, NetworkMessage,
+    NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, StatusCode,
 };
 
 use super::application::Application;
@@ -60,6 +60,8 @@ pub(crate) struct Heard {
     pub(crate) secured: bool,
     /// The builtin type of the only field, if the message contains the type and has a single field.
     pub(crate) only: Option<(uadp::BuiltinType, bool)>,
+    /// The worst quality in the last message with values.
+    pub(crate) quality: StatusCode,
 }
 
 /// The reason why a message was dropped.
@@ -199,6 +201,14 @@ impl Book {
             .map(|((topic, kind, from), found)| (*topic, *kind, &found.described, *from))
     }
 
+    /// Returns all announcements with their senders, in the order of topics.
+    pub(crate) fn all_announced(
+        &self,
+    ) -> impl Iterator<Item = (TopicId, Kind, &Arc<Described>, SocketAddr)> {
+        let all = self.announced.iter();
+        all.map(|((topic, kind, from), found)| (*topic, *kind, &found.described, *from))
+    }
+
     /// Returns the announced calls.
     pub(crate) fn calls(&self) -> impl Iterator<Item = (TopicId, &Arc<Described>)> {
         let calls = self.announced().filter(|(_, kind, ..)| *kind == Kind::Call);
@@ -307,6 +317,7 @@ impl Book {
             changed_hands: 0,
             secured: false,
             only: None,
+            quality: StatusCode::GOOD,
         });
         heard.changed_hands += u64::from(heard.from != from);
         (heard.last, heard.from) = (now, from);
@@ -317,10 +328,13 @@ impl Book {
                 heard.values += 1;
             }
         }
-        if let Some(message) = message
-            && heard.only.is_none()
-        {
-            heard.only = only(message);
+        if let Some(message) = message {
+            if heard.only.is_none() {
+                heard.only = only(message);
+            }
+            if message.kind != MessageKind::KeepAlive {
+                heard.quality = quality(message);
+            }
         }
         Some(topic)
     }
@@ -515,6 +529,25 @@ fn only(message: &DataSetMessage<'_>) -> Option<(uadp::BuiltinType, bool)> {
     let builtin = value.builtin_type()?;
     let is_array = !matches!(value, uadp::Variant::Scalar(_));
     values.next().is_none().then_some((builtin, is_array))
+}
+
+/// Returns the worst StatusCode of a message and its fields.
+fn quality(message: &DataSetMessage<'_>) -> StatusCode {
+    let of_message = message.header().status.map(StatusCode::from_status);
+    let mut worst = of_message.unwrap_or(StatusCode::GOOD);
+    if message.encoding() == FieldEncoding::DataValue
+        && let Ok(values) = message.values()
+    {
+        let all = values.filter_map(|value| value.ok()?.value.status);
+        worst = all.fold(worst, |worst, status| {
+            // The upper two bits are the severity.
+            match status.0 >> 30 > worst.0 >> 30 {
+                true => status,
+                false => worst,
+            }
+        });
+    }
+    worst
 }
 
 /// The bit of a StatusCode that marks the severity Bad.

@@ -7,6 +7,7 @@ mod words;
 
 use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::io::{self, Write as _};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -133,43 +134,43 @@ struct Asking<'a> {
 impl Asking<'_> {
     /// Waits until the call is announced.
     async fn find(&mut self) -> Result<(TopicId, Arc<Described>), Failure> {
-        let target = &self.arguments.target;
-        match target {
-            Target::Topic(topic) => self.live.want(*topic),
-            // A bridge without values is found by a probe for applications.
-            Target::Name(_) => {
-                self.live.want_all();
-                self.live.want_calls([0]);
-            }
-        }
-        let start = format!("{target}.Start");
-        let fits = |topic: TopicId, described: &Described| match target {
-            Target::Topic(wanted) => topic == *wanted,
-            Target::Name(name) => described.name == *name || described.name == start,
-        };
         let end = until(self.live.now(), Some(self.arguments.wait));
-        let mut found = None;
-        let mut each = |news: News<'_>, _| match news {
-            News::Announced(topic, Kind::Call, described, from) if fits(topic, described) => {
-                found = Some((topic, Arc::clone(described), from));
-                Go::Enough
-            }
-            News::Announced(..) | News::Sample(_) | News::Response(..) => Go::On,
+        let target = (&self.arguments.target, Some(Kind::Call));
+        let mut ignored = |_: News<'_>, _| Go::On;
+        let topic = self.live.resolve(target, end, &mut ignored).await?;
+        let Some(topic) = topic else {
+            return Err(self.not_found());
         };
-        let ended = self.live.listen(end, &mut each).await?;
-        match (found, ended) {
-            (Some((topic, described, from)), _) => {
-                self.executor = Executor::at(from);
-                if self.live.book.announcers(topic) > 1 {
-                    warn(&format!(
-                        "{topic} is announced from several addresses; the first one counts"
-                    ));
+        let mut found = self.announced(topic);
+        if found.is_none() {
+            let mut each = |news: News<'_>, _| match news {
+                News::Announced(of, Kind::Call, described, from) if of == topic => {
+                    found = Some((Arc::clone(described), from));
+                    Go::Enough
                 }
-                Ok((topic, described))
+                News::Announced(..) | News::Sample(_) | News::Response(..) => Go::On,
+            };
+            if self.live.listen(end, &mut each).await? == Ended::Interrupted {
+                return Err(Failure::Interrupted);
             }
-            (None, Ended::Interrupted) => Err(Failure::Interrupted),
-            (None, Ended::Time | Ended::Enough) => Err(self.not_found()),
         }
+        let Some((described, from)) = found else {
+            return Err(self.not_found());
+        };
+        self.executor = Executor::at(from);
+        if self.live.book.announcers(topic) > 1 {
+            warn(&format!(
+                "{topic} is announced from several addresses; the first one counts"
+            ));
+        }
+        Ok((topic, described))
+    }
+
+    /// Returns the description of an announced call, and the first sender that announced it.
+    fn announced(&self, topic: TopicId) -> Option<(Arc<Described>, SocketAddr)> {
+        let mut all = self.live.book.announced();
+        let found = all.find(|(of, kind, ..)| (*of, *kind) == (topic, Kind::Call));
+        found.map(|(_, _, described, from)| (Arc::clone(described), from))
     }
 
     fn not_found(&self) -> Failure {
@@ -265,6 +266,7 @@ impl Asking<'_> {
         let halt = Described {
             name: String::new(),
             description: String::new(),
+            ros_topics: Vec::new(),
             what: described::What::Value(Vec::new()),
         };
         self.begin((places.halt, &halt), &[0, 0], self.timeout())
@@ -458,6 +460,7 @@ impl Asking<'_> {
             let none = Described {
                 name: String::new(),
                 description: String::new(),
+                ros_topics: Vec::new(),
                 what: described::What::Value(Vec::new()),
             };
             if self.turn(&none, end, &mut came).await? == Ended::Interrupted {

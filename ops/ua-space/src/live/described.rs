@@ -6,29 +6,34 @@
 
 use mappings::TopicId;
 use serde::Serialize;
-use uadp::discovery::{ActionMetaData, DataSetMetaDataType, DataTypeSchemaHeader, FieldMetaData};
+use uadp::discovery::{
+    ActionMetaData, DataSetMetaDataType, DataTypeSchemaHeader, EUInformation, FieldMetaData, Range,
+    Settings as _,
+};
 use uadp::{BuiltinType, Scalar, Variant};
 
 use super::structure::Structure;
 
 /// The announced description of a topic or call.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Described {
     /// The display name of the DataSet or Action; may be empty.
     pub(crate) name: String,
     /// The description by the writer.
     pub(crate) description: String,
+    /// The ROS topics and services of a value, each with its space.
+    pub(crate) ros_topics: Vec<(u8, String)>,
     pub(crate) what: What,
 }
 
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) enum What {
     Value(Vec<Field>),
     Call(Call),
 }
 
 /// The request and response of a call, and its targets.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Call {
     pub(crate) request: Vec<Field>,
     pub(crate) response: Vec<Field>,
@@ -47,7 +52,7 @@ pub(crate) struct Action {
 }
 
 /// A field of a DataSet.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Field {
     pub(crate) name: String,
     /// `None` for an id that is not a builtin type.
@@ -60,10 +65,22 @@ pub(crate) struct Field {
     pub(crate) max_string_length: u32,
     /// The description for people.
     pub(crate) description: String,
+    pub(crate) meaning: Meaning,
     /// True if a request may leave the field out.
     pub(crate) optional: bool,
     /// The fields of the messages in this field.
     pub(crate) structure: Option<Structure>,
+}
+
+/// The meaning of a field, as far as it is announced.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Meaning {
+    /// The symbol of the unit; may be empty.
+    pub(crate) unit: String,
+    /// The lowest and the highest value.
+    pub(crate) range: Option<(f64, f64)>,
+    /// The default value of a parameter, as text.
+    pub(crate) default: Option<String>,
 }
 
 /// A field as `--json` shows it.
@@ -76,6 +93,12 @@ pub(crate) struct ShownField<'a> {
     description: &'a str,
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     optional: bool,
+    #[serde(skip_serializing_if = "str::is_empty")]
+    unit: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    range: Option<[f64; 2]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    default: Option<&'a str>,
 }
 
 impl Described {
@@ -87,6 +110,7 @@ impl Described {
         Ok(Self {
             name: called(meta_data.name)?,
             description: bounded(meta_data.description.text, "the description")?,
+            ros_topics: ros_topics(meta_data),
             what: What::Value(fields(meta_data)?),
         })
     }
@@ -104,6 +128,7 @@ impl Described {
         Ok(Self {
             name: called(meta_data.request.name)?,
             description: bounded(meta_data.request.description.text, "the description")?,
+            ros_topics: ros_topics(&meta_data.request),
             what: What::Call(Call {
                 request: fields(&meta_data.request)?,
                 response: fields(&meta_data.response)?,
@@ -111,6 +136,13 @@ impl Described {
                 action: action(&meta_data.request),
             }),
         })
+    }
+
+    /// Returns the names for people: the display name and the ROS topics.
+    pub(crate) fn names(&self) -> impl Iterator<Item = &str> {
+        let name = Some(self.name.as_str()).filter(|name| !name.is_empty());
+        let ros = self.ros_topics.iter().map(|(_, topic)| topic.as_str());
+        name.into_iter().chain(ros)
     }
 
     /// Returns the fields of the values, or of the response of the call.
@@ -170,7 +202,11 @@ impl Described {
             What::Value(fields) => of(fields),
             What::Call(call) => of(&call.request) + of(&call.response) + call.targets.len() * 2,
         };
-        size_of::<Self>() + self.name.len() + self.description.len() + what
+        let ros = self.ros_topics.iter();
+        let ros: usize = ros
+            .map(|(_, topic)| topic.len() + size_of::<String>())
+            .sum();
+        size_of::<Self>() + self.name.len() + self.description.len() + ros + what
     }
 }
 
@@ -188,6 +224,25 @@ impl Field {
         }
     }
 
+    /// Returns unit, range and default in words; empty if none is announced.
+    pub(crate) fn meaning(&self) -> String {
+        let Meaning {
+            unit,
+            range,
+            default,
+        } = &self.meaning;
+        let unit = match unit.as_str() {
+            "" => String::new(),
+            unit => format!(" {unit}"),
+        };
+        let range = range.map(|(low, high)| format!("{low} to {high}{unit}"));
+        let only_unit = Some(unit.trim_start()).filter(|unit| !unit.is_empty());
+        let range = range.or_else(|| only_unit.map(str::to_owned));
+        let default = default.as_ref().map(|default| format!("default {default}"));
+        let parts: Vec<String> = range.into_iter().chain(default).collect();
+        parts.join(", ")
+    }
+
     pub(crate) const fn is_array(&self) -> bool {
         self.rank != -1
     }
@@ -198,6 +253,9 @@ impl Field {
             kind: self.kind(),
             description: &self.description,
             optional: self.optional,
+            unit: &self.meaning.unit,
+            range: self.meaning.range.map(|(low, high)| [low, high]),
+            default: self.meaning.default.as_deref(),
         }
     }
 }
@@ -256,6 +314,7 @@ fn read(
         dimensions: field.array_dimensions.iter().collect(),
         max_string_length: field.max_string_length,
         description: bounded(field.description.text, "the description of a field")?,
+        meaning: meaning(field),
         optional: field
             .properties
             .iter()
@@ -265,6 +324,52 @@ fn read(
                 property.key.name == Some(OPTIONAL) && property.value == yes
             }),
     })
+}
+
+/// Reads unit, range and default of a field, as far as they are well formed.
+fn meaning(field: &FieldMetaData<'_>) -> Meaning {
+    let mut meaning = Meaning::default();
+    for property in field.properties.iter().take(MOST_PROPERTIES) {
+        match (property.key.name, property.value) {
+            (Some("EngineeringUnits"), Variant::Scalar(Scalar::ExtensionObject(object))) => {
+                let unit = EUInformation::from_object(&object);
+                let symbol = unit.ok().flatten().and_then(|unit| unit.display_name.text);
+                let symbol = symbol.filter(|symbol| symbol.len() <= MOST_TEXT);
+                meaning.unit = symbol.unwrap_or_default().to_owned();
+            }
+            (Some("EURange"), Variant::Scalar(Scalar::ExtensionObject(object))) => {
+                let range = Range::from_object(&object).ok().flatten();
+                meaning.range = range.map(|range| (range.low, range.high));
+            }
+            (Some("Default"), Variant::Scalar(Scalar::String(Some(text)))) => {
+                meaning.default = Some(text.to_owned()).filter(|text| text.len() <= MOST_TEXT);
+            }
+            _ => {}
+        }
+    }
+    meaning
+}
+
+/// Reads the ROS topics from the first field, as far as they are well formed.
+fn ros_topics(meta_data: &DataSetMetaDataType<'_>) -> Vec<(u8, String)> {
+    let Some(first) = meta_data.fields.get(0) else {
+        return Vec::new();
+    };
+    let mut properties = first.properties.iter().take(MOST_PROPERTIES);
+    let property = properties.find(|property| property.key.name == Some(ROS_TOPICS));
+    let Some(Variant::Array(topics)) = property.map(|property| property.value) else {
+        return Vec::new();
+    };
+    let topics = topics.iter().take(MOST_ROS_TOPICS);
+    let topics = topics.filter_map(|topic| {
+        let Scalar::String(Some(text)) = topic else {
+            return None;
+        };
+        let (space, topic) = text.split_once(' ')?;
+        let topic = Some(topic).filter(|topic| topic.len() <= MOST_TEXT)?;
+        Some((space.parse().ok()?, topic.to_owned()))
+    });
+    topics.collect()
 }
 
 /// Reads the parts of an action from the first field of a request that sends goals.
@@ -297,12 +402,15 @@ fn bounded(text: Option<&str>, what: &'static str) -> Result<String, &'static st
     }
 }
 
+/// The property of the first field with the ROS topics, each as `1 /joint_states`.
+const ROS_TOPICS: &str = "RosTopics";
 /// The property of a field that a request may leave out.
 const OPTIONAL: &str = "Optional";
 /// The property of the first field of a request that sends goals: the DataSetWriterIds of cancel,
 /// result, feedback and status.
 const ACTION_FAMILY: &str = "ActionFamily";
 const MOST_PROPERTIES: usize = 64;
+const MOST_ROS_TOPICS: usize = 16;
 const MOST_TEXT: usize = 1024;
 const MOST_FIELDS: usize = 1000;
 const MOST_DIMENSIONS: usize = 8;
@@ -316,6 +424,7 @@ mod tests {
         Described {
             name: "gripper.Grasp.State".to_owned(),
             description: description.to_owned(),
+            ros_topics: Vec::new(),
             what: What::Value(Vec::new()),
         }
     }
@@ -342,6 +451,7 @@ mod tests {
             dimensions: dimensions.to_vec(),
             max_string_length: 0,
             description: String::new(),
+            meaning: Meaning::default(),
             optional: false,
             structure: None,
         };

@@ -4,13 +4,16 @@ use std::collections::VecDeque;
 use std::io::{self, Write as _};
 use std::time::Duration;
 
+use mappings::TopicId;
 use serde::Serialize;
-use uadp::MessageKind;
+use uadp::{DecodeError, MessageKind};
 
-use super::book::{News, Sample};
+use super::book::{Kind, News, Sample};
 use super::described::Described;
 use super::list::{json, unheard};
+use super::names::unknown;
 use super::plain::{self, Named};
+use super::text::harmless;
 use super::{Ended, Go, Live, in_group, until};
 use crate::arguments::{Echo, Hz};
 use crate::exit::Failure;
@@ -20,19 +23,21 @@ use crate::report::warn;
 /// Runs `ua-space echo`.
 pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
-        live.want(arguments.topic);
+        let end = until(live.now(), arguments.seconds);
+        let (topic, early) = found(&mut live, arguments, end).await?;
         let mut echo = Printing {
             arguments,
+            topic,
             shown: 0,
             waiting: Some(VecDeque::new()),
             left_out: 0,
             unread: None,
         };
+        echo.take_early(early);
         // The names of the fields may arrive shortly after the first value.
         let named = until(live.now(), Some(NAMED_WITHIN));
-        let end = until(live.now(), arguments.seconds);
         let mut ended = echo.listen(&mut live, named.min(end)).await?;
-        echo.print_waiting(live.book.described(arguments.topic).map(AsRef::as_ref))?;
+        echo.print_waiting(live.book.described(topic).map(AsRef::as_ref))?;
         if ended == Ended::Time && named < end && !echo.is_enough() {
             ended = echo.listen(&mut live, end).await?;
         }
@@ -44,8 +49,36 @@ pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
     })
 }
 
+/// Returns the topic, and its values that came before the topic of a name was known.
+async fn found(
+    live: &mut Live,
+    arguments: &Echo,
+    end: Duration,
+) -> Result<(TopicId, Vec<Raw>), Failure> {
+    let mut early: VecDeque<(TopicId, Raw)> = VecDeque::new();
+    let mut each = |news: News<'_>, _| {
+        if let News::Sample(sample) = news
+            && let Ok(Some(raw)) = Raw::of(&sample)
+        {
+            if early.len() >= MOST_EARLY {
+                early.pop_front();
+            }
+            early.push_back((sample.topic, raw));
+        }
+        Go::On
+    };
+    let target = (&arguments.target, Some(Kind::Value));
+    let Some(topic) = live.resolve(target, end, &mut each).await? else {
+        let seconds = arguments.seconds.unwrap_or_default();
+        return Err(unknown(live, &arguments.target, seconds));
+    };
+    let early = early.into_iter().filter(|(of, _)| *of == topic);
+    Ok((topic, early.map(|(_, raw)| raw).collect()))
+}
+
 struct Printing<'a> {
     arguments: &'a Echo,
+    topic: TopicId,
     shown: u64,
     /// Values that wait for names; `None` once waiting has ended.
     waiting: Option<VecDeque<Raw>>,
@@ -56,15 +89,46 @@ struct Printing<'a> {
 
 /// A received value, to be shown when the names are known.
 struct Raw {
+    /// The announced name of the topic.
+    name: Option<String>,
     shown: Named,
     has_names: bool,
     at: Option<String>,
     kind: MessageKind,
 }
 
+fn first_name(described: &Described) -> Option<String> {
+    described.names().next().map(str::to_owned)
+}
+
+impl Raw {
+    /// Reads a message; `None` for a keep-alive message.
+    ///
+    /// # Errors
+    /// [`DecodeError`] if its values cannot be read.
+    fn of(sample: &Sample<'_>) -> Result<Option<Self>, DecodeError> {
+        if sample.message.kind == MessageKind::KeepAlive {
+            return Ok(None);
+        }
+        let described = sample.described.as_deref();
+        let shown = plain::message(&sample.message, described)?;
+        let time = sample.message.header().timestamp;
+        let time = time.or(sample.network.timestamp);
+        Ok(Some(Self {
+            name: described.and_then(first_name),
+            shown,
+            has_names: described.is_some(),
+            at: time.map(iso_time::of_date_time),
+            kind: sample.message.kind,
+        }))
+    }
+}
+
 #[derive(Serialize)]
 struct Shown<'a> {
     topic: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     time: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -73,13 +137,23 @@ struct Shown<'a> {
 }
 
 impl Printing<'_> {
+    /// Queues values that came before the topic of the name was known.
+    fn take_early(&mut self, early: Vec<Raw>) {
+        if let Some(waiting) = &mut self.waiting {
+            waiting.extend(early);
+        }
+    }
+
     async fn listen(&mut self, live: &mut Live, end: Duration) -> Result<Ended, Failure> {
+        if self.is_enough() && self.waiting.is_none() {
+            return Ok(Ended::Enough);
+        }
         let mut fault = None;
         let mut each = |news: News<'_>, _| {
             let News::Sample(sample) = news else {
                 return Go::On;
             };
-            if sample.topic != self.arguments.topic {
+            if sample.topic != self.topic {
                 return Go::On;
             }
             match self.take(&sample) {
@@ -102,12 +176,10 @@ impl Printing<'_> {
     }
 
     fn take(&mut self, sample: &Sample<'_>) -> Result<Go, Failure> {
-        if sample.message.kind == MessageKind::KeepAlive {
-            return Ok(Go::On);
-        }
         let described = sample.described.as_deref();
-        let shown = match plain::message(&sample.message, described) {
-            Ok(shown) => shown,
+        let raw = match Raw::of(sample) {
+            Ok(Some(raw)) => raw,
+            Ok(None) => return Ok(Go::On),
             Err(error) => {
                 if self.unread.is_none() {
                     warn(&format!("{}: {error}", sample.topic));
@@ -115,14 +187,6 @@ impl Printing<'_> {
                 self.unread = Some(error.to_string());
                 return Ok(Go::On);
             }
-        };
-        let header = sample.message.header();
-        let time = header.timestamp.or(sample.network.timestamp);
-        let raw = Raw {
-            shown,
-            has_names: described.is_some(),
-            at: time.map(iso_time::of_date_time),
-            kind: sample.message.kind,
         };
         match &mut self.waiting {
             Some(waiting) if !raw.has_names && waiting.len() < MOST_WAITING => {
@@ -151,6 +215,7 @@ impl Printing<'_> {
         for mut raw in waiting {
             if let Some(described) = described {
                 raw.shown.rename(described.fields());
+                raw.name = first_name(described);
             }
             if !self.is_enough() {
                 self.print(&raw)?;
@@ -175,7 +240,8 @@ impl Printing<'_> {
         };
         if self.arguments.json {
             let shown = Shown {
-                topic: self.arguments.topic.to_string(),
+                topic: self.topic.to_string(),
+                name: raw.name.as_deref(),
                 time: raw.at.as_deref(),
                 kind,
                 value: &raw.shown,
@@ -184,14 +250,16 @@ impl Printing<'_> {
         } else {
             let at = raw.at.as_deref().unwrap_or("without a time");
             let kind = kind.map(|kind| format!(", {kind}")).unwrap_or_default();
-            write!(out, "--- # {at}{kind}\n{}", raw.shown.yaml())?;
+            let name = raw.name.as_deref().map(|name| format!(", {name}"));
+            let name = harmless(&name.unwrap_or_default());
+            write!(out, "--- # {at}{kind}{name}\n{}", raw.shown.yaml())?;
         }
         out.flush()?;
         Ok(())
     }
 
     fn nothing(&self, live: &Live) -> Failure {
-        let topic = self.arguments.topic;
+        let topic = self.topic;
         let secured = live.book.heard(topic).is_some_and(|heard| heard.secured);
         match &self.unread {
             Some(why) => Failure::Data(format!("{topic}: nothing that came can be read: {why}")),
@@ -207,13 +275,19 @@ impl Printing<'_> {
 pub(crate) fn hz(arguments: &Hz) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), arguments.seconds);
+        let seconds = arguments.seconds.unwrap_or_default();
+        let target = (&arguments.target, Some(Kind::Value));
+        let found = live.resolve(target, end, &mut |_, _| Go::On).await?;
+        let Some(topic) = found else {
+            return Err(unknown(&live, &arguments.target, seconds));
+        };
         let mut times: VecDeque<Duration> = VecDeque::new();
         let mut all = 0_u64;
         loop {
             let next = until(live.now(), Some(REPORT)).min(end);
             let mut each = |news: News<'_>, now| {
                 if let News::Sample(sample) = news
-                    && sample.topic == arguments.topic
+                    && sample.topic == topic
                     && sample.message.kind != MessageKind::KeepAlive
                 {
                     all += 1;
@@ -232,11 +306,7 @@ pub(crate) fn hz(arguments: &Hz) -> Result<(), Failure> {
                 warn("no two values yet");
             }
             if last && all == 0 && ended == Ended::Time {
-                return Err(unheard(
-                    &live,
-                    arguments.topic,
-                    arguments.seconds.unwrap_or_default(),
-                ));
+                return Err(unheard(&live, topic, seconds));
             }
             if last {
                 return Ok(());
@@ -308,6 +378,8 @@ impl Rhythm {
 
 /// Time that values wait for their names, in seconds.
 const NAMED_WITHIN: f64 = 1.2;
+/// Maximum number of values that are stored while the topic of a name is not known.
+const MOST_EARLY: usize = 1024;
 /// Maximum number of waiting values.
 const MOST_WAITING: usize = 256;
 /// Interval of the reports of `hz`, in seconds.

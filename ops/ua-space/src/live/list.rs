@@ -6,23 +6,30 @@ use std::time::Duration;
 
 use mappings::{SpaceId, TopicId};
 use serde::Serialize;
+use uadp::StatusCode;
 
-use super::book::{Book, Heard, Kind};
+use super::book::{Book, Heard, Kind, News};
 use super::described::{Described, Field, ShownField, What};
-use super::text::{Table, age, harmless};
+use super::names::unknown;
+use super::text::{Table, age, harmless, wrapped};
 use super::{Go, Live, in_group, until};
 use crate::arguments::Info;
 use crate::exit::Failure;
+use crate::status;
 
 /// Runs `ua-space info`.
 pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
         let end = until(live.now(), Some(arguments.seconds));
-        live.want(arguments.topic);
-        live.listen(end, &mut |_, _| Go::On).await?;
+        let mut ignored = |_: News<'_>, _| Go::On;
+        let target = (&arguments.target, None);
+        let Some(topic) = live.resolve(target, end, &mut ignored).await? else {
+            return Err(unknown(&live, &arguments.target, arguments.seconds));
+        };
+        live.listen(end, &mut ignored).await?;
         let lines = lines(&live.book, live.now());
-        let Some(line) = lines.iter().find(|line| line.topic == arguments.topic) else {
-            return Err(unheard(&live, arguments.topic, arguments.seconds));
+        let Some(line) = lines.iter().find(|line| line.topic == topic) else {
+            return Err(unheard(&live, topic, arguments.seconds));
         };
         let mut out = io::stdout().lock();
         match arguments.json {
@@ -37,7 +44,11 @@ pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
 pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> Failure {
     let group = live.group();
     let heard = live.book.topics().count();
-    let what = format!("{topic} was not heard in {group} for {seconds} s");
+    let announced = live.book.announced();
+    let mut names = announced.filter(|(of, ..)| *of == topic);
+    let name = names.find_map(|(_, _, described, _)| described.names().next().map(harmless));
+    let name = name.map(|name| format!(" ({name})")).unwrap_or_default();
+    let what = format!("{topic}{name} was not heard in {group} for {seconds} s");
     let help = match heard {
         0 => "nothing else was heard either; is this the group and the interface (--address, --interface)?".to_owned(),
         1 => "one other topic was heard; `ua-space list` shows it".to_owned(),
@@ -72,6 +83,8 @@ pub(super) struct Shown<'l> {
     space: u8,
     origin: &'static str,
     name: Option<&'l str>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    ros_topics: Vec<RosTopic<'l>>,
     #[serde(rename = "type")]
     type_name: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -86,9 +99,18 @@ pub(super) struct Shown<'l> {
     keep_alives: u64,
     rate_hz: Option<f64>,
     age_s: Option<f64>,
+    /// The quality of the last value.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    quality: Option<String>,
     secured: bool,
     sender: &'l str,
     sender_changed: u64,
+}
+
+#[derive(Serialize)]
+struct RosTopic<'l> {
+    space: u8,
+    topic: &'l str,
 }
 
 pub(super) fn lines(book: &Book, now: Duration) -> Vec<Line<'_>> {
@@ -127,24 +149,56 @@ fn rate(heard: &Heard) -> Option<f64> {
     (span > 0.0).then(|| gaps as f64 / span)
 }
 
-const HEAD: [&str; 7] = ["TOPIC", "KIND", "ORIGIN", "NAME", "RATE", "LAST", "TYPE"];
+const HEAD: [&str; 9] = [
+    "TOPIC",
+    "NAME",
+    "ROS TOPIC",
+    "KIND",
+    "ORIGIN",
+    "RATE",
+    "LAST",
+    "QUALITY",
+    "TYPE",
+];
+
+/// The columns that are shortened first: the type, the ROS topic and the name.
+const YIELDING: [usize; 3] = [8, 2, 1];
 
 pub(super) fn table(lines: &[&Line<'_>]) -> Table {
-    let mut table = Table::new(HEAD.map(str::to_owned));
+    let mut table = Table::new(HEAD.map(str::to_owned)).yielding(YIELDING);
     for line in lines {
         let dash = || "-".to_owned();
+        let quality = line.quality().filter(|quality| quality != GOOD);
         table.row([
             line.topic.to_string(),
+            line.name().map_or_else(dash, str::to_owned),
+            line.ros_topic().map_or_else(dash, str::to_owned),
             line.kind().to_owned(),
             origin(line.topic.space).to_owned(),
-            line.name().map_or_else(dash, str::to_owned),
             line.rate.map_or_else(dash, |rate| format!("{rate:.1}/s")),
             line.age.map_or_else(dash, age),
+            quality.unwrap_or_else(dash),
             line.type_name().unwrap_or_else(dash),
         ]);
     }
-    table
+    table.without_empty_columns()
 }
+
+/// Returns the name of a StatusCode, or its severity and number.
+pub(super) fn quality_name(status: StatusCode) -> String {
+    // The lower 16 bits are flags of the value.
+    if let Some(name) = status::symbol(StatusCode(status.0 & 0xFFFF_0000)) {
+        return name.to_owned();
+    }
+    let severity = match status.0 >> 30 {
+        0 => GOOD,
+        1 => "Uncertain",
+        _ => "Bad",
+    };
+    format!("{severity} ({:#010x})", status.0)
+}
+
+const GOOD: &str = "Good";
 
 /// Spaces that are probed for calls before any message is received from them.
 pub(super) const FIRST_ASKED: [u16; 3] = [0, 1, 2];
@@ -169,6 +223,23 @@ impl Line<'_> {
     fn name(&self) -> Option<&str> {
         let name = self.described?.name.as_str();
         (!name.is_empty()).then_some(name)
+    }
+
+    /// Returns the ROS topic in the space of origin, or else the first ROS topic.
+    fn ros_topic(&self) -> Option<&str> {
+        let all = &self.described?.ros_topics;
+        let own = all
+            .iter()
+            .find(|(space, _)| *space == self.topic.space.get());
+        own.or_else(|| all.first()).map(|(_, topic)| topic.as_str())
+    }
+
+    /// Returns the quality of the last value.
+    fn quality(&self) -> Option<String> {
+        let heard = self
+            .heard
+            .filter(|heard| !heard.secured && heard.values > 0)?;
+        Some(quality_name(heard.quality))
     }
 
     fn type_name(&self) -> Option<String> {
@@ -196,7 +267,16 @@ impl Line<'_> {
         let description = self
             .described
             .map(|described| described.description.as_str());
+        let ros_topics = self.described.map(|described| &described.ros_topics);
+        let ros_topics = ros_topics.into_iter().flatten();
         Shown {
+            ros_topics: ros_topics
+                .map(|(space, topic)| RosTopic {
+                    space: *space,
+                    topic,
+                })
+                .collect(),
+            quality: self.quality(),
             topic: self.topic.to_string(),
             kind: self.kind(),
             space: self.topic.space.get(),
@@ -221,14 +301,18 @@ impl Line<'_> {
     fn told(&self) -> String {
         let mut text = String::new();
         let mut line = |name: &str, value: &str| {
-            text.push_str(&harmless(&format!("{:<12} {value}", format!("{name}:"))));
-            text.push('\n');
+            let head = format!("{:<12} ", format!("{name}:"));
+            text.push_str(&wrapped(&head, &harmless(value)));
         };
         line("topic", &self.topic.to_string());
         line("kind", self.kind());
         line("origin", origin(self.topic.space));
         if let Some(name) = self.name() {
             line("name", name);
+        }
+        let ros = self.described.map(|described| &described.ros_topics);
+        for (space, topic) in ros.into_iter().flatten() {
+            line("ROS topic", &format!("{topic} in space {space}"));
         }
         if let Some(described) = self.described.filter(|it| !it.description.is_empty()) {
             line("description", &described.description);
@@ -242,6 +326,9 @@ impl Line<'_> {
         line("sender", &self.from);
         if let Some(heard) = self.heard {
             line("values", &heard.values.to_string());
+            if let Some(quality) = self.quality() {
+                line("quality", &quality);
+            }
             if let Some(rate) = self.rate {
                 line("rate", &format!("{rate:.1}/s"));
             }
@@ -260,9 +347,11 @@ impl Line<'_> {
         };
         for (what, fields) in parts {
             for field in fields {
-                let about = match field.description.as_str() {
-                    "" => String::new(),
-                    about => format!("  # {about}"),
+                let about = [field.meaning(), field.description.clone()];
+                let about: Vec<String> = about.into_iter().filter(|it| !it.is_empty()).collect();
+                let about = match about.as_slice() {
+                    [] => String::new(),
+                    about => format!("  # {}", about.join(". ")),
                 };
                 line(what, &format!("{}: {}{about}", field.name, field.kind()));
             }

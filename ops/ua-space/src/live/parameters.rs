@@ -152,6 +152,7 @@ fn scalar(builtin: BuiltinType, text: &str) -> Result<Value, String> {
 mod tests {
     use uadp::action::ActionFields;
 
+    use super::super::described::Meaning;
     use super::super::plain;
     use super::*;
 
@@ -163,6 +164,7 @@ mod tests {
             dimensions: size.into_iter().collect(),
             max_string_length: 0,
             description: String::new(),
+            meaning: Meaning::default(),
             optional,
             structure: None,
         }

@@ -4,7 +4,10 @@
 
 mod info;
 mod start;
+mod types;
 mod watch;
+
+pub(crate) use types::types;
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
@@ -99,6 +102,7 @@ async fn hear(
 /// and topics.
 pub(crate) fn heard_names(group: &Group) -> Result<HeardNames, Failure> {
     in_group(group, async |mut live| {
+        live.want_all();
         let (found, _) = hear(&mut live, FOR_NAMES, &|_| false).await?;
         let mut components: Vec<String> =
             found.iter().map(|skill| skill.component.clone()).collect();
@@ -114,6 +118,12 @@ pub(crate) fn heard_names(group: &Group) -> Result<HeardNames, Failure> {
                 .topics()
                 .map(|(topic, _)| topic.to_string())
                 .collect(),
+            names: live
+                .book
+                .announced()
+                .flat_map(|(_, _, described, _)| described.names())
+                .map(str::to_owned)
+                .collect(),
         })
     })
 }
@@ -125,6 +135,8 @@ pub(crate) struct HeardNames {
     pub(crate) skills: Vec<String>,
     pub(crate) calls: Vec<String>,
     pub(crate) topics: Vec<String>,
+    /// The names of values and calls, and the ROS topics.
+    pub(crate) names: Vec<String>,
 }
 
 /// The last states and results of skills.
@@ -259,7 +271,7 @@ fn result_of(state: TopicId) -> Option<TopicId> {
 const HEAD: [&str; 6] = ["COMPONENT", "SKILL", "TYPE", "STATE", "RUN", "CALL"];
 
 fn table(skills: &[Skill]) -> Table {
-    let mut table = Table::new(HEAD.map(str::to_owned));
+    let mut table = Table::new(HEAD.map(str::to_owned)).yielding([5, 2]);
     for skill in skills {
         let dash = || "-".to_owned();
         let silent = Duration::try_from_secs_f64(skill.age_s).unwrap_or_default();

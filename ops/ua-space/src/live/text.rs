@@ -2,10 +2,13 @@
 
 use std::io::{self, IsTerminal as _, Write};
 
-/// A table with columns of the necessary width; the last column is not padded.
+/// A table that fits the terminal. Columns have the necessary width; if the table is too wide, the
+/// cells of its widest columns are shortened.
 pub(crate) struct Table {
     head: Vec<String>,
     rows: Vec<Vec<String>>,
+    /// The columns that give way first, in this order.
+    yielding: Vec<usize>,
 }
 
 impl Table {
@@ -13,7 +16,14 @@ impl Table {
         Self {
             head: head.into_iter().map(|name| harmless(&name)).collect(),
             rows: Vec::new(),
+            yielding: Vec::new(),
         }
+    }
+
+    /// Sets the columns that are shortened before all other columns, in their order.
+    pub(crate) fn yielding(mut self, columns: impl Into<Vec<usize>>) -> Self {
+        self.yielding = columns.into();
+        self
     }
 
     /// Adds a row; unprintable characters are escaped.
@@ -22,20 +32,45 @@ impl Table {
             .push(cells.into_iter().map(|cell| harmless(&cell)).collect());
     }
 
-    /// Writes the table; with `bold`, the head is bold.
+    /// Removes the columns that have no content in any row.
+    pub(crate) fn without_empty_columns(mut self) -> Self {
+        let is_empty = |cell: Option<&String>| {
+            cell.is_none_or(|cell| cell.is_empty() || cell == "-" || cell == "?")
+        };
+        let kept: Vec<bool> = (0..self.head.len())
+            .map(|at| at == 0 || !self.rows.iter().all(|row| is_empty(row.get(at))))
+            .collect();
+        let keep = |cells: Vec<String>| -> Vec<String> {
+            let cells = cells.into_iter().zip(&kept);
+            cells
+                .filter_map(|(cell, kept)| kept.then_some(cell))
+                .collect()
+        };
+        let moved = |at: &usize| {
+            let is_kept = kept.get(*at).copied().unwrap_or(false);
+            let before = kept.iter().take(*at).filter(|kept| **kept).count();
+            is_kept.then_some(before)
+        };
+        self.yielding = self.yielding.iter().filter_map(moved).collect();
+        self.head = keep(self.head);
+        self.rows = self.rows.into_iter().map(keep).collect();
+        self
+    }
+
+    /// Writes the table in the width of the terminal; with `bold`, the head is bold.
     pub(crate) fn write(&self, out: &mut impl Write, bold: bool) -> io::Result<()> {
-        let mut widths: Vec<usize> = self.head.iter().map(|text| text.chars().count()).collect();
-        for row in &self.rows {
-            for (width, cell) in widths.iter_mut().zip(row) {
-                *width = (*width).max(cell.chars().count());
-            }
-        }
+        self.write_within(width(), out, bold)
+    }
+
+    fn write_within(&self, limit: usize, out: &mut impl Write, bold: bool) -> io::Result<()> {
+        let widths = self.widths(limit);
         let line = |cells: &mut dyn Iterator<Item = &str>| {
             let mut line = String::new();
             for (cell, width) in cells.zip(&widths) {
-                line.push_str(cell);
+                let cell = shortened(cell, *width);
+                line.push_str(&cell);
                 let rest = width.saturating_sub(cell.chars().count());
-                line.extend(std::iter::repeat_n(' ', rest + 2));
+                line.extend(std::iter::repeat_n(' ', rest + GAP));
             }
             line.trim_end().to_owned()
         };
@@ -49,7 +84,105 @@ impl Table {
         }
         Ok(())
     }
+
+    /// Returns the widths of the columns. Columns keep their heads if possible.
+    fn widths(&self, limit: usize) -> Vec<usize> {
+        let heads: Vec<usize> = self.head.iter().map(|text| text.chars().count()).collect();
+        let mut widths = heads.clone();
+        for row in &self.rows {
+            for (width, cell) in widths.iter_mut().zip(row) {
+                *width = (*width).max(cell.chars().count());
+            }
+        }
+        let gaps = GAP * widths.len().saturating_sub(1);
+        let mut excess = (widths.iter().sum::<usize>() + gaps).saturating_sub(limit);
+        for at in &self.yielding {
+            let least = heads.get(*at).copied().unwrap_or_default().max(LEAST);
+            if let Some(width) = widths.get_mut(*at) {
+                let cut = excess.min(width.saturating_sub(least));
+                *width -= cut;
+                excess -= cut;
+            }
+        }
+        while excess > 0 {
+            let widest = widths.iter_mut().max();
+            let Some(widest) = widest.filter(|width| **width > LEAST) else {
+                break;
+            };
+            *widest -= 1;
+            excess -= 1;
+        }
+        widths
+    }
 }
+
+/// Returns a text of at most `width` characters. A name loses its middle, because names often
+/// differ at their ends only; a text with spaces loses its end.
+pub(crate) fn shortened(text: &str, width: usize) -> String {
+    let length = text.chars().count();
+    if length <= width {
+        return text.to_owned();
+    }
+    let Some(room) = width.checked_sub(1) else {
+        return String::new();
+    };
+    let tail = match text.contains(' ') {
+        true => 0,
+        false => room * 3 / 5,
+    };
+    let head = text.chars().take(room - tail);
+    let tail = text.chars().skip(length - tail);
+    head.chain(['…']).chain(tail).collect()
+}
+
+/// Returns lines of at most the width of the terminal: `head`, and the words of the text. The
+/// further lines are indented like the text. A word is never broken.
+pub(crate) fn wrapped(head: &str, text: &str) -> String {
+    wrapped_within(width(), head, text)
+}
+
+fn wrapped_within(limit: usize, head: &str, text: &str) -> String {
+    let indent = head.chars().count();
+    let mut lines = String::new();
+    let mut line = head.to_owned();
+    let mut is_first = true;
+    for word in text.split(' ') {
+        let length = line.chars().count() + word.chars().count() + usize::from(!is_first);
+        if !is_first && length > limit {
+            lines.push_str(line.trim_end());
+            lines.push('\n');
+            line = " ".repeat(indent);
+            is_first = true;
+        }
+        if !is_first {
+            line.push(' ');
+        }
+        line.push_str(word);
+        is_first = false;
+    }
+    lines.push_str(line.trim_end());
+    lines.push('\n');
+    lines
+}
+
+/// Returns the width for output: of `COLUMNS`, of the terminal, or 80 columns.
+pub(crate) fn width() -> usize {
+    let set = std::env::var("COLUMNS").ok();
+    let set = set.and_then(|columns| columns.parse::<usize>().ok());
+    let terminal = || {
+        let size = io::stdout().is_terminal().then(crossterm::terminal::size);
+        size.and_then(Result::ok).map(|(columns, _)| columns.into())
+    };
+    let columns = set.or_else(terminal).filter(|columns| *columns > 0);
+    columns.unwrap_or(80).max(NARROWEST)
+}
+
+/// The number of spaces between columns.
+const GAP: usize = 2;
+/// The number of characters that a shortened cell keeps.
+const LEAST: usize = 8;
+/// The width below which output is not fitted.
+const NARROWEST: usize = 40;
 
 /// Returns true if stdout is a terminal and colours are not disabled.
 pub(crate) fn is_coloured() -> bool {
@@ -99,9 +232,54 @@ mod tests {
         table.row(["ua_1_2_10".to_owned(), "a\x1b[2Jb\n\u{202e}c".to_owned()]);
         table.row(["ua_1_2_1".to_owned(), "ü".to_owned()]);
         let mut out = Vec::new();
-        table.write(&mut out, false).unwrap();
+        table.write_within(80, &mut out, false).unwrap();
         let wanted = "TOPIC      NAME\nua_1_2_10  a\\u{1b}[2Jb\\u{a}\\u{202e}c\nua_1_2_1   ü\n";
         assert_eq!(String::from_utf8(out).unwrap(), wanted);
+    }
+
+    #[test]
+    fn a_wide_table_is_fitted_by_shortening_the_cells_that_matter_least() {
+        let head = ["TOPIC", "NAME", "EMPTY", "TYPE"].map(str::to_owned);
+        let mut table = Table::new(head).yielding([3, 1]);
+        let cells = [
+            "ua_0_7_101",
+            "parallel-gripper.Grasp.State",
+            "-",
+            "(Force: Double, Name: String) -> (success: Boolean)",
+        ];
+        table.row(cells.map(str::to_owned));
+        let table = table.without_empty_columns();
+        let shown = |limit| {
+            let mut out = Vec::new();
+            table.write_within(limit, &mut out, false).unwrap();
+            String::from_utf8(out).unwrap()
+        };
+        let wide = "TOPIC       NAME                          TYPE\n\
+                    ua_0_7_101  parallel-gripper.Grasp.State  (Force: Double, Name: String) -> (success: Boolean)\n";
+        assert_eq!(shown(200), wide);
+        let fitted = "TOPIC       NAME                          TYPE\n\
+                      ua_0_7_101  parallel-gripper.Grasp.State  (Force: Double, Name: String) -> (suc…\n";
+        assert_eq!(shown(80), fitted);
+        let narrow = shown(41);
+        assert!(
+            narrow.contains("ua_0_7_101  paral") && narrow.contains(".State  "),
+            "{narrow}"
+        );
+        for limit in [41, 60, 80, 100] {
+            assert!(
+                shown(limit)
+                    .lines()
+                    .all(|line| line.chars().count() <= limit)
+            );
+        }
+    }
+
+    #[test]
+    fn a_text_is_wrapped_between_words_and_indented() {
+        let wrapped = wrapped_within(24, "about:  ", "the force of the gripper in N");
+        assert_eq!(wrapped, "about:  the force of the\n        gripper in N\n");
+        let long = wrapped_within(10, "a: ", "unbreakable_word b");
+        assert_eq!(long, "a: unbreakable_word\n   b\n");
     }
 
     #[test]

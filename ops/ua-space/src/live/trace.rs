@@ -38,7 +38,11 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
             })
             .await?;
             live.tell_dropped();
-            Ok(delays.rows())
+            let mut rows = delays.rows();
+            for row in &mut rows {
+                row.name = row.topic.parse().ok().and_then(|topic| live.name_of(topic));
+            }
+            Ok(rows)
         })?;
     }
     let servers: Vec<Server> = arguments
@@ -86,6 +90,8 @@ struct Hop {
 #[derive(Debug, Serialize)]
 struct Row {
     topic: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<String>,
     hop: &'static str,
     #[serde(flatten)]
     delays: Hop,
@@ -181,6 +187,7 @@ impl Delays {
         hops.filter_map(|(topic, hop, window)| {
             Some(Row {
                 topic: topic.to_string(),
+                name: None,
                 hop,
                 delays: window.hop()?,
             })
@@ -247,13 +254,14 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
         };
         [p50, p99, max, hop.count.to_string(), negative]
     };
-    let head = |first: &[&str]| {
+    let head = |first: &[&str], last: &[&str]| {
         let rest = ["P50", "P99", "MAX", "COUNT", "NEGATIVE"];
-        Table::new(first.iter().chain(&rest).map(|name| (*name).to_owned()))
+        let names = first.iter().chain(&rest).chain(last);
+        Table::new(names.map(|name| (*name).to_owned()))
     };
     let bold = is_coloured();
     if !programs.is_empty() {
-        let mut table = head(&["PROGRAM", "SPACE", "HOP"]);
+        let mut table = head(&["PROGRAM", "SPACE", "HOP"], &[]).yielding([2]);
         for program in programs {
             for (hop, delays) in &program.hops {
                 let first = [
@@ -264,18 +272,20 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
                 table.row(first.into_iter().chain(figures(delays)));
             }
         }
-        table.write(&mut out, bold)?;
+        table.without_empty_columns().write(&mut out, bold)?;
     }
     if !topics.is_empty() {
         if !programs.is_empty() {
             writeln!(out)?;
         }
-        let mut table = head(&["TOPIC", "HOP"]);
+        let mut table = head(&["TOPIC", "HOP"], &["NAME"]).yielding([7]);
         for row in topics {
+            let name = row.name.clone().unwrap_or_else(|| "-".to_owned());
             let first = [row.topic.clone(), called(row.hop)];
-            table.row(first.into_iter().chain(figures(&row.delays)));
+            let cells = first.into_iter().chain(figures(&row.delays));
+            table.row(cells.chain([name]));
         }
-        table.write(&mut out, bold)?;
+        table.without_empty_columns().write(&mut out, bold)?;
     } else if programs.is_empty() {
         writeln!(out, "nothing that says its times was heard")?;
     }
@@ -285,10 +295,10 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
 /// Returns the description of a hop.
 fn called(hop: &str) -> String {
     match hop {
-        "out" => "out: from here into the space".to_owned(),
-        ORIGIN => "origin: in the writer's program".to_owned(),
-        NETWORK => "network: from there to here".to_owned(),
-        "in" => "in: from the space to here".to_owned(),
+        "out" => "out: into space".to_owned(),
+        ORIGIN => "origin: at writer".to_owned(),
+        NETWORK => "network: to here".to_owned(),
+        "in" => "in: from space".to_owned(),
         other => other.to_owned(),
     }
 }

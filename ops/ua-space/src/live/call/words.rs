@@ -198,6 +198,7 @@ mod tests {
             dimensions: dimensions.to_vec(),
             max_string_length: 0,
             description: String::new(),
+            meaning: crate::live::described::Meaning::default(),
             optional: false,
             structure: None,
         }

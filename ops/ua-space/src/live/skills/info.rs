@@ -7,11 +7,11 @@ use serde::Serialize;
 use super::{Ended, Skill, hear, in_group};
 use crate::arguments::InfoSkill;
 use crate::exit::Failure;
-use crate::live::described::ShownField;
+use crate::live::described::{Field, ShownField};
 use crate::live::list::json;
 use crate::live::plain::Named;
 use crate::live::run::results;
-use crate::live::text::harmless;
+use crate::live::text::{Table, harmless, is_coloured, wrapped};
 
 pub(super) fn info(arguments: &InfoSkill) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
@@ -41,16 +41,55 @@ pub(super) fn info(arguments: &InfoSkill) -> Result<(), Failure> {
             writeln!(out, "{}", json(&whole)?)?;
         } else {
             for (what, text) in whole.lines() {
-                writeln!(
-                    out,
-                    "{}",
-                    harmless(&format!("{:<12} {text}", format!("{what}:")))
-                )?;
+                let head = format!("{:<12} ", format!("{what}:"));
+                write!(out, "{}", wrapped(&head, &harmless(&text)))?;
+            }
+            if !skill.parameters.is_empty() {
+                writeln!(out)?;
+                parameters(&skill.parameters).write(&mut out, is_coloured())?;
             }
         }
         live.tell_dropped();
         Ok(())
     })
+}
+
+/// Returns the table of the parameters of Start.
+pub(super) fn parameters(fields: &[Field]) -> Table {
+    let head = [
+        "PARAMETER",
+        "TYPE",
+        "UNIT",
+        "RANGE",
+        "DEFAULT",
+        "DESCRIPTION",
+    ];
+    let mut table = Table::new(head.map(str::to_owned)).yielding([5, 4]);
+    for field in fields {
+        let meaning = &field.meaning;
+        let range = meaning.range.map(|(low, high)| format!("{low} to {high}"));
+        let default = match (&meaning.default, field.optional) {
+            (Some(default), _) => default.clone(),
+            (None, true) => "optional".to_owned(),
+            (None, false) => "required".to_owned(),
+        };
+        table.row([
+            field.name.clone(),
+            field.kind(),
+            or_dash(&meaning.unit),
+            range.unwrap_or_else(|| "-".to_owned()),
+            default,
+            or_dash(&field.description),
+        ]);
+    }
+    table.without_empty_columns()
+}
+
+fn or_dash(text: &str) -> String {
+    match text {
+        "" => "-".to_owned(),
+        text => text.to_owned(),
+    }
 }
 
 /// Returns the failure for a skill that was not found, with the received skills.
@@ -112,21 +151,6 @@ impl Whole<'_> {
         }
         if let Some(run) = skill.run.filter(|run| *run > 0) {
             lines.push(("run", run.to_string()));
-        }
-        for field in &skill.parameters {
-            let optional = if field.optional {
-                ", may be left out"
-            } else {
-                ""
-            };
-            let about = match field.description.as_str() {
-                "" => String::new(),
-                about => format!("  # {about}"),
-            };
-            lines.push((
-                "parameter",
-                format!("{}: {}{optional}{about}", field.name, field.kind()),
-            ));
         }
         if let Some(ending) = result {
             let how = if ending.succeeded {

@@ -1,0 +1,16 @@
+//! The programs of a cell: `ua-space status` shows them, `ua-space doctor` looks for faults.
+
+mod doctor;
+mod overview;
+mod pages;
+mod processes;
+
+pub(crate) use doctor::doctor;
+pub(crate) use overview::status;
+pub(crate) use pages::Page;
+
+/// Returns the status pages of the programs on this host.
+pub(crate) async fn pages_of_this_host() -> Vec<Page> {
+    let (processes, _) = processes::read(std::path::Path::new("/"));
+    pages::of_processes(&processes).await
+}

@@ -1,0 +1,276 @@
+use std::net::Ipv4Addr;
+
+use super::super::super::pages::{CertificatePage, Page, TopicPage};
+use super::super::super::processes::{Process, UdpSocket};
+use super::super::facts::Announced;
+use super::super::host::{InterfaceFacts, Route, Switch};
+use super::*;
+use crate::live::{Timing, TopicSeen};
+
+/// Returns the facts of a host with one bridge, without any fault.
+fn healthy() -> Facts {
+    let mut facts = Facts {
+        version: "0.1.0".to_owned(),
+        now: 1_790_000_000,
+        ..Facts::default()
+    };
+    facts.group.address = "239.192.0.40:4840".to_owned();
+    facts.group.seconds = 3.0;
+    facts.group.applications.push(announced(1, "10.0.0.5:4000"));
+    facts.group.topics.push(TopicSeen {
+        topic: "ua_1_2_10".to_owned(),
+        name: Some("Speed".to_owned()),
+        types: vec!["geometry_msgs/Twist".to_owned()],
+        ..TopicSeen::default()
+    });
+    facts.host.name = "gateway".to_owned();
+    facts.host.interfaces.push(InterfaceFacts {
+        name: "eth0".to_owned(),
+        address: "10.0.0.5".to_owned(),
+        up: true,
+        round_trip: Some(Ok(40.0)),
+    });
+    let group = Ipv4Addr::new(239, 192, 0, 40);
+    facts
+        .host
+        .memberships
+        .insert("eth0".to_owned(), vec![group]);
+    facts.host.routes.push(Route {
+        interface: "eth0".to_owned(),
+        destination: 0,
+        mask: 0,
+    });
+    facts.host.processes.push(Process {
+        pid: 7,
+        program: "bridge-ros1".to_owned(),
+        open_files: 20,
+        most_open_files: Some(1024),
+        ..Process::default()
+    });
+    for (path, value) in [(RMEM_MAX, 8 << 20), (IPFRAG_HIGH, 32 << 20)] {
+        facts.host.settings.insert(path.to_owned(), value);
+    }
+    facts.pages.push(page("bridge-ros1", 1));
+    facts
+}
+
+fn announced(space: u16, from: &str) -> Announced {
+    Announced {
+        space,
+        from: from.to_owned(),
+        ..Announced::default()
+    }
+}
+
+fn page(program: &str, space: u8) -> Page {
+    let mut page = Page {
+        program: program.to_owned(),
+        version: Some("0.1.0".to_owned()),
+        space,
+        url: "http://127.0.0.1:9101".to_owned(),
+        ..Page::default()
+    };
+    page.mapping.hash = "0123456789abcdef".to_owned();
+    page
+}
+
+/// Returns the codes of the findings after a change of the healthy facts.
+fn after(change: impl FnOnce(&mut Facts)) -> Vec<&'static str> {
+    let mut facts = healthy();
+    change(&mut facts);
+    of(&facts).iter().map(|one| one.code).collect()
+}
+
+#[test]
+fn a_healthy_cell_has_no_findings() {
+    assert_eq!(of(&healthy()), []);
+}
+
+#[test]
+fn faults_of_the_network_are_found() {
+    let fault = after(|facts| facts.group.fault = Some("no such interface".to_owned()));
+    assert_eq!(fault, ["D001"]);
+    let down = after(|facts| facts.host.interfaces.clear());
+    assert_eq!(down, ["D001"]);
+    let member = after(|facts| facts.host.memberships.clear());
+    assert_eq!(member, ["D002"]);
+    let trip = after(|facts| {
+        let failed = Err("nothing came back".to_owned());
+        facts.host.interfaces[0].round_trip = Some(failed);
+    });
+    assert_eq!(trip, ["D003"]);
+    let route = after(|facts| facts.host.routes.clear());
+    assert_eq!(route, ["D004"]);
+    let silent = after(|facts| {
+        facts.group.topics.clear();
+        facts.group.applications.clear();
+    });
+    assert_eq!(silent, ["D007"]);
+    let rules = after(|facts| facts.host.firewall.push("policy drop".to_owned()));
+    assert_eq!(rules, ["D070"]);
+    let switch = after(|facts| {
+        facts.host.switches.push(Switch {
+            name: "br0".to_owned(),
+            snooping: true,
+            querier: false,
+        });
+    });
+    assert_eq!(switch, ["D071"]);
+}
+
+#[test]
+fn holders_of_the_port_and_lost_datagrams_are_found() {
+    let socket = |pid, drops| UdpSocket {
+        local: "0.0.0.0:4840".parse().unwrap(),
+        inode: 1,
+        drops,
+        pid: Some(pid),
+        command: "python3".to_owned(),
+    };
+    assert_eq!(after(|facts| facts.host.udp.push(socket(99, 0))), ["D005"]);
+    assert!(after(|facts| facts.host.udp.push(socket(7, 0))).is_empty());
+    assert_eq!(after(|facts| facts.host.udp.push(socket(7, 3))), ["D006"]);
+}
+
+#[test]
+fn faults_of_ros_1_are_found() {
+    let master = after(|facts| {
+        facts.ros1.is_wanted = true;
+        facts.ros1.fault = Some("refused".to_owned());
+    });
+    assert_eq!(master, ["D010"]);
+    let names = after(|facts| {
+        facts.ros1.is_wanted = true;
+        let node = |name: &str| (name.to_owned(), "ned".to_owned());
+        facts.ros1.unresolved = vec![node("/a"), node("/b")];
+    });
+    assert_eq!(names, ["D011"]);
+    let ip = after(|facts| {
+        facts.ros1.is_wanted = true;
+        facts.ros1.ros_ip = Some("10.0.0.99".to_owned());
+    });
+    assert_eq!(ip, ["D012"]);
+    let name = after(|facts| {
+        facts.ros1.is_wanted = true;
+        facts.ros1.master_addresses = vec!["10.0.0.7".parse().unwrap()];
+        facts.ros1.own_name_addresses = vec!["127.0.1.1".parse().unwrap()];
+    });
+    assert_eq!(name, ["D012"]);
+}
+
+#[test]
+fn settings_of_ros_2_that_hide_nodes_are_found() {
+    for (name, value, code) in [
+        ("ROS_LOCALHOST_ONLY", "1", "D020"),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "localhost", "D020"),
+        ("ROS_DISCOVERY_SERVER", "10.0.0.1:11811", "D021"),
+        ("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "D022"),
+    ] {
+        let set = |facts: &mut Facts| {
+            let variables = &mut facts.ros2.variables;
+            variables.insert(name.to_owned(), value.to_owned());
+        };
+        assert_eq!(after(set), [code], "{name}");
+    }
+    let domain = after(|facts| {
+        facts.pages.push(page("bridge-ros2", 2));
+        let variables = &mut facts.ros2.variables;
+        variables.insert("ROS_DOMAIN_ID".to_owned(), "7".to_owned());
+    });
+    assert_eq!(domain, ["D023"]);
+}
+
+#[test]
+fn programs_that_disagree_are_found() {
+    let two = after(|facts| facts.group.applications.push(announced(1, "10.0.0.6:4000")));
+    assert_eq!(two, ["D030"]);
+    let triple = after(|facts| facts.group.topics[0].sender_changed = 9);
+    assert_eq!(triple, ["D031"]);
+    let restarted = after(|facts| facts.group.topics[0].sender_changed = 1);
+    assert!(restarted.is_empty());
+    let mapping = after(|facts| {
+        let mut other = page("bridge-ros2", 2);
+        other.mapping.hash = "f".to_owned();
+        facts.pages.push(other);
+    });
+    assert_eq!(mapping, ["D032"]);
+    let types = after(|facts| facts.group.topics[0].types.push("std_msgs/Bool".to_owned()));
+    assert_eq!(types, ["D033"]);
+    let version = after(|facts| {
+        let version = Some("0.2.0".to_owned());
+        facts.pages.push(Page {
+            version,
+            ..page("ua-server", 0)
+        });
+    });
+    assert_eq!(version, ["D036"]);
+    let clock = after(|facts| {
+        facts.group.senders.push(Timing {
+            from: "10.0.0.6:4000".to_owned(),
+            shortest_delay_us: -3_000_000,
+        });
+    });
+    assert_eq!(clock, ["D040"]);
+}
+
+#[test]
+fn what_programs_report_is_found() {
+    let mut facts = healthy();
+    let topic = TopicPage {
+        dropped: BTreeMap::from([("too_big".to_owned(), 4)]),
+        ..TopicPage::default()
+    };
+    facts.pages[0].topics.insert("ua_1_2_10".to_owned(), topic);
+    let found = of(&facts);
+    assert_eq!(found[0].code, "D034");
+    assert!(
+        found[0].what.contains("4 of Speed (ua_1_2_10) (too_big)"),
+        "{found:?}"
+    );
+    let ready = after(|facts| facts.pages[0].not_ready.push("no keys".to_owned()));
+    assert_eq!(ready, ["D035"]);
+    let waiting = after(|facts| facts.pages[0].waiting_for.push("/speed".to_owned()));
+    assert_eq!(waiting, ["D035"]);
+    let stale = after(|facts| facts.pages[0].mapping.stale = Some("M014".to_owned()));
+    assert_eq!(stale, ["D037"]);
+}
+
+fn set(facts: &mut Facts, path: &str, value: u64) {
+    facts.host.settings.insert(path.to_owned(), value);
+}
+
+#[test]
+fn limits_of_the_host_are_found() {
+    let rmem = after(|facts| set(facts, RMEM_MAX, 212_992));
+    assert_eq!(rmem, ["D050"]);
+    let frag = after(|facts| set(facts, IPFRAG_HIGH, 262_144));
+    assert_eq!(frag, ["D052"]);
+    assert_eq!(after(|facts| facts.host.reassembly_failures = 2), ["D052"]);
+    let poll = after(|facts| {
+        facts.host.is_virtual = true;
+        facts.host.settings.insert(HALT_POLL.to_owned(), 0);
+    });
+    assert_eq!(poll, ["D053"]);
+    assert_eq!(
+        after(|facts| facts.host.processes[0].open_files = 900),
+        ["D051"]
+    );
+}
+
+#[test]
+fn certificates_are_found_before_they_expire() {
+    let until = |day: &str| {
+        let certificate = CertificatePage {
+            name: "ua-server".to_owned(),
+            until: day.to_owned(),
+        };
+        after(|facts| facts.pages[0].certificate = Some(certificate))
+    };
+    // The facts are of 2026-09-21.
+    assert_eq!(day_number("1970-01-01"), Some(0));
+    assert_eq!(day_number("2026-09-21"), Some(1_790_000_000 / DAY));
+    assert_eq!(until("2026-09-20"), ["D060"]);
+    assert_eq!(until("2026-10-01"), ["D060"]);
+    assert!(until("2026-11-01").is_empty());
+    assert!(until("nonsense").is_empty());
+}

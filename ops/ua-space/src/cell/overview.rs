@@ -1,0 +1,390 @@
+//! `ua-space status`: shows all programs of the cell, whether they are ready, and what they wait
+//! for.
+
+use std::collections::BTreeSet;
+use std::io::{self, Write as _};
+use std::net::{IpAddr, SocketAddr};
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::pages::{self, Page};
+use super::processes::{self, Process};
+use crate::arguments::{Group, StatusArguments};
+use crate::exit::Failure;
+use crate::live::{Application, Table, harmless, in_the_group, is_coloured, json, wrapped};
+use crate::report::warn;
+use crate::survey::look;
+
+/// Runs `ua-space status`.
+pub(crate) fn status(arguments: &StatusArguments) -> Result<(), Failure> {
+    let found = look(find(&arguments.urls, &arguments.group, arguments.seconds))?;
+    let programs = programs(&found);
+    let mut out = io::stdout().lock();
+    if arguments.json {
+        writeln!(
+            out,
+            "{}",
+            json(&Shown {
+                programs: &programs
+            })?
+        )?;
+    } else if !programs.is_empty() {
+        table(&programs).write(&mut out, is_coloured())?;
+        for line in programs.iter().flat_map(Program::reasons) {
+            write!(out, "{line}")?;
+        }
+    }
+    out.flush()?;
+    let unready = programs
+        .iter()
+        .filter(|one| one.state == State::NotReady)
+        .count();
+    match (programs.len(), unready) {
+        (0, _) => Err(Failure::Unavailable(NOBODY.to_owned())),
+        (_, 0) => Ok(()),
+        (all, 1) => Err(Failure::Failed(format!("1 of {all} programs is not ready"))),
+        (all, some) => Err(Failure::Failed(format!(
+            "{some} of {all} programs are not ready"
+        ))),
+    }
+}
+
+/// The programs on this host, at the given URLs and in the group.
+pub(super) struct Cell {
+    pub(super) processes: Vec<Process>,
+    pub(super) pages: Vec<Page>,
+    /// Announced applications: space, sender and description.
+    pub(super) applications: Vec<(u16, SocketAddr, Application)>,
+    pub(super) own_addresses: BTreeSet<IpAddr>,
+}
+
+async fn find(urls: &[String], group: &Group, seconds: f64) -> Result<Cell, Failure> {
+    let (processes, _) = processes::read(Path::new("/"));
+    let (pages, heard) = tokio::join!(all_pages(&processes, urls), in_the_group(group, seconds));
+    let applications = match heard {
+        Ok((heard, ())) => applications(heard.applications),
+        Err(failure) => {
+            warn(&format!("the group is not heard: {failure}"));
+            Vec::new()
+        }
+    };
+    Ok(Cell {
+        processes,
+        pages,
+        applications,
+        own_addresses: own_addresses(),
+    })
+}
+
+/// Returns the pages of the processes of this host and of the URLs. A URL without an answer is
+/// reported.
+pub(super) async fn all_pages(processes: &[Process], urls: &[String]) -> Vec<Page> {
+    let mut pages = pages::of_processes(processes).await;
+    for url in urls {
+        match pages::of_url(url).await {
+            Ok(found) => {
+                let is_new = |one: &Page| {
+                    !pages.iter().any(|known| {
+                        known.url.trim_start_matches("http://")
+                            == one.url.trim_start_matches("http://")
+                    })
+                };
+                let new: Vec<Page> = found.into_iter().filter(is_new).collect();
+                pages.extend(new);
+            }
+            Err(failure) => {
+                warn(&failure.to_string());
+                pages.push(Page {
+                    program: "?".to_owned(),
+                    not_ready: vec![format!("no status at {url}")],
+                    url: url.clone(),
+                    ..Page::default()
+                });
+            }
+        }
+    }
+    pages
+}
+
+pub(super) fn applications(
+    heard: impl IntoIterator<Item = ((u16, String), Application)>,
+) -> Vec<(u16, SocketAddr, Application)> {
+    let all = heard.into_iter();
+    all.filter_map(|((space, from), one)| Some((space, from.parse().ok()?, one)))
+        .collect()
+}
+
+pub(super) fn own_addresses() -> BTreeSet<IpAddr> {
+    let interfaces = transport::interfaces().unwrap_or_default();
+    interfaces
+        .into_iter()
+        .map(|interface| IpAddr::V4(interface.address))
+        .collect()
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum State {
+    Ready,
+    NotReady,
+    /// It runs on this host without a status page.
+    Running,
+    /// It is known by its announcement in the group only.
+    Announced,
+}
+
+/// A program in a space.
+#[derive(Debug, Serialize)]
+struct Program {
+    program: String,
+    space: Option<u16>,
+    state: State,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    not_ready: Vec<String>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    waiting_for: Vec<String>,
+    version: Option<String>,
+    uptime_s: Option<u64>,
+    mapping_file: Option<String>,
+    mapping_hash: Option<String>,
+    /// The URL of its status, or its address in the group.
+    address: Option<String>,
+    pid: Option<u32>,
+}
+
+#[derive(Serialize)]
+struct Shown<'a> {
+    programs: &'a [Program],
+}
+
+fn programs(cell: &Cell) -> Vec<Program> {
+    let mut all: Vec<Program> = cell.pages.iter().map(of_page).collect();
+    let mut local = BTreeSet::new();
+    for process in &cell.processes {
+        let has_page = cell.pages.iter().any(|page| page.pid == Some(process.pid));
+        let announced = cell.applications.iter().filter(|(_, from, _)| {
+            let is_here = cell.own_addresses.contains(&from.ip());
+            is_here && process.udp.iter().any(|own| own.port() == from.port())
+        });
+        let mut spaces = BTreeSet::new();
+        for (space, from, _) in announced {
+            local.insert((*space, *from));
+            spaces.insert(*space);
+        }
+        if has_page {
+            continue;
+        }
+        let spaces: Vec<Option<u16>> = match spaces.is_empty() {
+            true => vec![None],
+            false => spaces.into_iter().map(Some).collect(),
+        };
+        all.extend(spaces.into_iter().map(|space| of_process(process, space)));
+    }
+    for (space, from, application) in &cell.applications {
+        if !local.contains(&(*space, *from)) {
+            all.push(of_application((*space, *from), application));
+        }
+    }
+    all.sort_by(|a, b| (a.space, &a.program, &a.address).cmp(&(b.space, &b.program, &b.address)));
+    all
+}
+
+fn of_page(page: &Page) -> Program {
+    let has_mapping = !page.mapping.hash.is_empty();
+    let mut not_ready = page.not_ready.clone();
+    // A mapping that cannot run is no reason for /readyz, because the previous mapping runs.
+    let mut waiting_for = page.waiting_for.clone();
+    if let Some(stale) = &page.mapping.stale {
+        waiting_for.push(format!("a mapping that can run: {stale}"));
+    }
+    not_ready.retain(|reason| !reason.is_empty());
+    Program {
+        program: page.program.clone(),
+        space: Some(page.space.into()),
+        state: match not_ready.is_empty() {
+            true => State::Ready,
+            false => State::NotReady,
+        },
+        not_ready,
+        waiting_for,
+        version: page.version.clone(),
+        uptime_s: page.uptime_s,
+        mapping_file: page.mapping.file.clone(),
+        mapping_hash: has_mapping.then(|| page.mapping.hash.clone()),
+        address: Some(page.url.clone()),
+        pid: page.pid,
+    }
+}
+
+fn of_process(process: &Process, space: Option<u16>) -> Program {
+    Program {
+        program: process.program.clone(),
+        space,
+        state: State::Running,
+        not_ready: Vec::new(),
+        waiting_for: Vec::new(),
+        version: None,
+        uptime_s: process.uptime_s,
+        mapping_file: None,
+        mapping_hash: None,
+        address: None,
+        pid: Some(process.pid),
+    }
+}
+
+fn of_application((space, from): (u16, SocketAddr), application: &Application) -> Program {
+    let name = match application.name.as_str() {
+        "" => &application.uri,
+        name => name,
+    };
+    Program {
+        program: name.to_owned(),
+        space: Some(space),
+        state: State::Announced,
+        not_ready: Vec::new(),
+        waiting_for: Vec::new(),
+        version: None,
+        uptime_s: None,
+        mapping_file: None,
+        mapping_hash: None,
+        address: Some(from.to_string()),
+        pid: None,
+    }
+}
+
+impl Program {
+    const fn word(&self) -> &'static str {
+        match self.state {
+            State::Ready if self.waiting_for.is_empty() => "ready",
+            State::Ready => "ready, waiting",
+            State::NotReady => "NOT READY",
+            State::Running => "running",
+            State::Announced => "announced",
+        }
+    }
+
+    /// Returns a line for each reason and each missing peer.
+    fn reasons(&self) -> Vec<String> {
+        let space = self.space.map(|space| format!(" (space {space})"));
+        let who = format!("{}{}", self.program, space.unwrap_or_default());
+        let not_ready = self.not_ready.iter().map(|why| format!("not ready: {why}"));
+        let waiting = self
+            .waiting_for
+            .iter()
+            .map(|peer| format!("waiting for {peer}"));
+        let mut lines: Vec<String> = not_ready.chain(waiting).collect();
+        if self.state == State::Running {
+            lines.push("no status: start it with --metrics 127.0.0.1:PORT to see more".to_owned());
+        }
+        let lines = lines.into_iter();
+        lines
+            .map(|line| wrapped(&format!("  {}: ", harmless(&who)), &harmless(&line)))
+            .collect()
+    }
+}
+
+const HEAD: [&str; 7] = [
+    "PROGRAM", "SPACE", "STATE", "VERSION", "UPTIME", "MAPPING", "WHERE",
+];
+
+fn table(programs: &[Program]) -> Table {
+    let mut table = Table::new(HEAD.map(str::to_owned)).yielding([6, 0]);
+    for one in programs {
+        let dash = || "-".to_owned();
+        let hash = one.mapping_hash.as_deref();
+        let hash = hash.map(|hash| hash.chars().take(8).collect::<String>());
+        table.row([
+            one.program.clone(),
+            one.space.map_or_else(dash, |space| space.to_string()),
+            one.word().to_owned(),
+            one.version.clone().unwrap_or_else(dash),
+            one.uptime_s.map_or_else(dash, uptime),
+            hash.unwrap_or_else(dash),
+            one.address.clone().unwrap_or_else(dash),
+        ]);
+    }
+    table
+}
+
+/// Formats a time as `42 s`, `12 min`, `3 h 5 min` or `2 d 4 h`.
+pub(super) fn uptime(seconds: u64) -> String {
+    match seconds {
+        0..120 => format!("{seconds} s"),
+        120..7_200 => format!("{} min", seconds / 60),
+        7_200..172_800 => format!("{} h {} min", seconds / 3_600, seconds % 3_600 / 60),
+        _ => format!("{} d {} h", seconds / 86_400, seconds % 86_400 / 3_600),
+    }
+}
+
+const NOBODY: &str = "no program of a cell runs on this host or announces itself in the group\n  \
+                      = help: is this the group and the interface (--address, --interface)? \
+                      `ua-space doctor` looks for faults";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn application(name: &str) -> Application {
+        Application {
+            uri: format!("urn:{name}"),
+            product_uri: String::new(),
+            name: name.to_owned(),
+            urls: Vec::new(),
+            capabilities: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_program_is_listed_once_whatever_is_known_of_it() {
+        let here: IpAddr = "10.0.0.1".parse().unwrap();
+        let process = |pid, program: &str, port| Process {
+            pid,
+            program: program.to_owned(),
+            udp: vec![SocketAddr::new(here, port)],
+            ..Process::default()
+        };
+        let page = Page {
+            program: "bridge-ros1".to_owned(),
+            space: 1,
+            not_ready: vec!["no ROS master".to_owned()],
+            pid: Some(7),
+            ..Page::default()
+        };
+        let at = |ip: &str, port: u16| SocketAddr::new(ip.parse().unwrap(), port);
+        let cell = Cell {
+            processes: vec![
+                process(7, "bridge-ros1", 1000),
+                process(8, "bridge-ros2", 2000),
+            ],
+            pages: vec![page],
+            applications: vec![
+                (1, at("10.0.0.1", 1000), application("bridge-ros1")),
+                (2, at("10.0.0.1", 2000), application("bridge-ros2")),
+                (3, at("10.0.0.9", 2000), application("bridge-ros2 on other")),
+            ],
+            own_addresses: BTreeSet::from([here]),
+        };
+        let all = programs(&cell);
+        let shown: Vec<_> = all.iter().map(|one| (one.space, one.word())).collect();
+        assert_eq!(
+            shown,
+            [
+                (Some(1), "NOT READY"),
+                (Some(2), "running"),
+                (Some(3), "announced")
+            ]
+        );
+        let reasons = all[0].reasons();
+        assert_eq!(
+            reasons,
+            ["  bridge-ros1 (space 1): not ready: no ROS master\n"]
+        );
+    }
+
+    #[test]
+    fn an_uptime_is_shown_in_two_units() {
+        let shown = [5, 130, 7_500, 200_000].map(uptime);
+        assert_eq!(shown, ["5 s", "2 min", "2 h 5 min", "2 d 7 h"]);
+    }
+}

@@ -1,0 +1,258 @@
+//! The programs of the project that run on this host, from `/proc`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+/// A running program of this project in the network namespace of the caller.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub(crate) struct Process {
+    pub(crate) pid: u32,
+    /// The name of the program, as `bridge-ros1`.
+    pub(crate) program: String,
+    /// The addresses at which it listens for TCP connections.
+    pub(crate) listening: Vec<SocketAddr>,
+    /// The local addresses of its UDP sockets.
+    pub(crate) udp: Vec<SocketAddr>,
+    pub(crate) uptime_s: Option<u64>,
+    pub(crate) open_files: usize,
+    /// The limit of open files.
+    pub(crate) most_open_files: Option<u64>,
+}
+
+/// A UDP socket of this host.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct UdpSocket {
+    pub(crate) local: SocketAddr,
+    pub(crate) inode: u64,
+    /// Datagrams that were dropped because the receive buffer was full.
+    pub(crate) drops: u64,
+    /// The process with the socket, if it is readable.
+    pub(crate) pid: Option<u32>,
+    pub(crate) command: String,
+}
+
+/// Reads the programs and the UDP sockets below a root: `/proc` is `<root>/proc`.
+pub(crate) fn read(root: &Path) -> (Vec<Process>, Vec<UdpSocket>) {
+    let proc = root.join("proc");
+    let mut udp = sockets(&proc, "udp");
+    udp.extend(sockets(&proc, "udp6"));
+    let mut tcp = sockets(&proc, "tcp");
+    tcp.extend(sockets(&proc, "tcp6"));
+    let owners = owners(&proc);
+    let mut programs = Vec::new();
+    for pid in pids(&proc) {
+        let folder = proc.join(pid.to_string());
+        let Some(program) = program(&folder) else {
+            continue;
+        };
+        if !is_same_network(&proc, &folder) {
+            continue;
+        }
+        let of = |rows: &[Row]| -> Vec<SocketAddr> {
+            let own = rows
+                .iter()
+                .filter(|row| owners.get(&row.inode) == Some(&pid));
+            let all: BTreeSet<SocketAddr> = own.map(|row| row.local).collect();
+            all.into_iter().collect()
+        };
+        let listening: Vec<Row> = tcp
+            .iter()
+            .filter(|row| row.state == LISTEN)
+            .cloned()
+            .collect();
+        let limits = fs::read_to_string(folder.join("limits")).unwrap_or_default();
+        programs.push(Process {
+            pid,
+            program,
+            listening: of(&listening),
+            udp: of(&udp),
+            uptime_s: uptime(&proc, &folder),
+            open_files: fs::read_dir(folder.join("fd")).map_or(0, Iterator::count),
+            most_open_files: most_open_files(&limits),
+        });
+    }
+    let sockets = udp.into_iter().map(|row| {
+        let pid = owners.get(&row.inode).copied();
+        UdpSocket {
+            local: row.local,
+            inode: row.inode,
+            drops: row.drops,
+            pid,
+            command: pid.map(|pid| command(&proc, pid)).unwrap_or_default(),
+        }
+    });
+    (programs, sockets.collect())
+}
+
+fn pids(proc: &Path) -> Vec<u32> {
+    let entries = fs::read_dir(proc).into_iter().flatten().flatten();
+    let names = entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+    let mut pids: Vec<u32> = names.collect();
+    pids.sort_unstable();
+    pids
+}
+
+/// Returns the process with each socket, by inode.
+fn owners(proc: &Path) -> BTreeMap<u64, u32> {
+    let mut owners = BTreeMap::new();
+    for pid in pids(proc) {
+        let folder = proc.join(pid.to_string()).join("fd");
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            let target = fs::read_link(entry.path()).unwrap_or_default();
+            let inode = target.to_str().and_then(|text| {
+                let inode = text.strip_prefix("socket:[")?.strip_suffix(']')?;
+                inode.parse().ok()
+            });
+            if let Some(inode) = inode {
+                owners.entry(inode).or_insert(pid);
+            }
+        }
+    }
+    owners
+}
+
+/// Returns the name of a program of this project from its command line.
+fn program(folder: &Path) -> Option<String> {
+    let line = fs::read(folder.join("cmdline")).ok()?;
+    let line = String::from_utf8_lossy(&line);
+    named(&mut line.split('\0'))
+}
+
+fn named(words: &mut dyn Iterator<Item = &str>) -> Option<String> {
+    let path = PathBuf::from(words.next()?);
+    let name = path.file_name()?.to_str()?.to_owned();
+    let name = match name.as_str() {
+        "ua-bridge" => format!("ua-{}", words.next()?),
+        _ => name,
+    };
+    PROGRAMS.contains(&name.as_str()).then_some(name)
+}
+
+/// Returns the name of any process.
+fn command(proc: &Path, pid: u32) -> String {
+    let name = fs::read_to_string(proc.join(pid.to_string()).join("comm"));
+    name.unwrap_or_default().trim().to_owned()
+}
+
+fn is_same_network(proc: &Path, folder: &Path) -> bool {
+    let of = |folder: &Path| fs::read_link(folder.join("ns/net")).ok();
+    match (of(&proc.join("self")), of(folder)) {
+        (Some(own), Some(other)) => own == other,
+        _ => true,
+    }
+}
+
+/// Returns the seconds since the start of a process.
+fn uptime(proc: &Path, folder: &Path) -> Option<u64> {
+    let stat = fs::read_to_string(folder.join("stat")).ok()?;
+    // The second field is the name in parentheses, which may contain spaces.
+    let (_, rest) = stat.rsplit_once(')')?;
+    let started: u64 = rest.split_whitespace().nth(19)?.parse().ok()?;
+    let system = fs::read_to_string(proc.join("uptime")).ok()?;
+    let system = system.split('.').next()?.parse::<u64>().ok()?;
+    Some(system.saturating_sub(started / TICKS))
+}
+
+fn most_open_files(limits: &str) -> Option<u64> {
+    let line = limits
+        .lines()
+        .find(|line| line.starts_with("Max open files"))?;
+    line.split_whitespace().nth(3)?.parse().ok()
+}
+
+/// A row of `/proc/net/udp` or `/proc/net/tcp`.
+#[derive(Debug, Clone, PartialEq)]
+struct Row {
+    local: SocketAddr,
+    state: u8,
+    inode: u64,
+    drops: u64,
+}
+
+fn sockets(proc: &Path, table: &str) -> Vec<Row> {
+    let path = proc.join("net").join(table);
+    let text = fs::read_to_string(path).unwrap_or_default();
+    text.lines().skip(1).filter_map(row).collect()
+}
+
+fn row(line: &str) -> Option<Row> {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    Some(Row {
+        local: address(words.get(1)?)?,
+        state: u8::from_str_radix(words.get(3)?, 16).ok()?,
+        inode: words.get(9)?.parse().ok()?,
+        drops: words
+            .get(12)
+            .and_then(|drops| drops.parse().ok())
+            .unwrap_or_default(),
+    })
+}
+
+/// Parses an address as `0100007F:12E8`: words of 32 bits in the byte order of the host.
+fn address(text: &str) -> Option<SocketAddr> {
+    let (ip, port) = text.split_once(':')?;
+    let port = u16::from_str_radix(port, 16).ok()?;
+    let word = |at: usize| u32::from_str_radix(ip.get(at..at + 8)?, 16).ok();
+    let ip = match ip.len() {
+        8 => IpAddr::V4(Ipv4Addr::from(word(0)?.to_ne_bytes())),
+        32 => {
+            let mut bytes = [0; 16];
+            for (at, part) in bytes.chunks_exact_mut(4).enumerate() {
+                part.copy_from_slice(&word(at * 8)?.to_ne_bytes());
+            }
+            IpAddr::from(bytes)
+        }
+        _ => return None,
+    };
+    Some(SocketAddr::new(ip, port))
+}
+
+/// The programs with a part in a cell.
+const PROGRAMS: [&str; 8] = [
+    "bridge-ros1",
+    "bridge-ros2",
+    "ua-server",
+    "ua-component",
+    "ua-lds",
+    "ua-gds",
+    "ua-station",
+    "ua-mes",
+];
+/// The state of a listening TCP socket.
+const LISTEN: u8 = 0x0A;
+/// Clock ticks per second in `/proc`, which is 100 on all architectures of Linux.
+const TICKS: u64 = 100;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn programs_are_known_by_their_links_and_by_the_word_after_ua_bridge() {
+        let of = |line: &str| named(&mut line.split(' '));
+        assert_eq!(
+            of("/usr/bin/bridge-ros1 cell.yaml").as_deref(),
+            Some("bridge-ros1")
+        );
+        assert_eq!(of("ua-bridge server").as_deref(), Some("ua-server"));
+        assert_eq!(of("ua-bridge space list"), None);
+        assert_eq!(of("/bin/bash"), None);
+    }
+
+    #[test]
+    fn sockets_and_limits_are_read_from_the_tables_of_the_kernel() {
+        let line = "  1: 0100007F:12E8 00000000:0000 0A 00000000:00000000 00:00000000 00000000 0 0 4711 2 0000000000000000 7";
+        let row = row(line).unwrap();
+        assert_eq!(row.local, "127.0.0.1:4840".parse().unwrap());
+        assert_eq!((row.state, row.inode, row.drops), (LISTEN, 4711, 7));
+        let six = address("00000000000000000000000001000000:0050").unwrap();
+        assert_eq!(six, "[::1]:80".parse().unwrap());
+        assert_eq!(address("nonsense"), None);
+        let limits = "Limit  Soft Limit  Hard Limit  Units\nMax open files            1024                 524288               files\n";
+        assert_eq!(most_open_files(limits), Some(1024));
+    }
+}

@@ -1,0 +1,67 @@
+//! `ua-space new`: writes a commented starting file.
+
+use std::fs::OpenOptions;
+use std::io::{self, Write as _};
+
+use crate::arguments::{New, Template};
+use crate::exit::Failure;
+use crate::report::warn;
+
+/// Runs `ua-space new`. An existing file stays unchanged.
+pub(crate) fn new(arguments: &New) -> Result<(), Failure> {
+    let text = text(arguments.template);
+    let Some(path) = &arguments.output else {
+        io::stdout().lock().write_all(text.as_bytes())?;
+        return Ok(());
+    };
+    let mut open = OpenOptions::new();
+    let file = open.write(true).create_new(true).open(path);
+    let name = path.display();
+    let mut file = file.map_err(|error| match error.kind() == io::ErrorKind::AlreadyExists {
+        true => Failure::Io(format!(
+            "{name} exists already\n  = help: name another file with --output"
+        )),
+        false => Failure::Io(format!("cannot write {name}: {error}")),
+    })?;
+    file.write_all(text.as_bytes())
+        .map_err(|error| Failure::Io(format!("cannot write {name}: {error}")))?;
+    let next = match arguments.template {
+        Template::Component => format!("ua-component --check {name}"),
+        Template::Mes => format!("ua-mes --check {name}"),
+        Template::Mapping => format!("ua-space check {name}"),
+    };
+    warn(&format!("{name} is written; next: {next}"));
+    Ok(())
+}
+
+const fn text(template: Template) -> &'static str {
+    match template {
+        Template::Component => include_str!("new/component.yaml"),
+        Template::Mes => include_str!("new/mes.yaml"),
+        Template::Mapping => include_str!("new/mapping.yaml"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_starting_mapping_runs_without_findings() {
+        let checked = mappings::Mapping::from_yaml(text(Template::Mapping), "mapping.yaml");
+        assert!(checked.mapping.is_some(), "{:?}", checked.findings);
+        assert!(checked.findings.is_empty(), "{:?}", checked.findings);
+    }
+
+    #[test]
+    fn starting_files_explain_each_key() {
+        for template in [Template::Component, Template::Mes, Template::Mapping] {
+            let lines: Vec<&str> = text(template).lines().collect();
+            let comments = lines
+                .iter()
+                .filter(|line| line.trim_start().starts_with('#'));
+            assert!(comments.count() * 3 > lines.len(), "{template:?}");
+            assert!(lines.iter().all(|line| line.len() <= 100), "{template:?}");
+        }
+    }
+}
