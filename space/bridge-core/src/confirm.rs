@@ -118,6 +118,11 @@ impl Confirming {
         (!spaces.is_empty()).then(|| Box::new(Self { within, spaces }))
     }
 
+    /// Returns the time in which the bridges have to confirm.
+    pub(crate) const fn within(&self) -> Duration {
+        self.within
+    }
+
     pub(crate) fn await_event(&self, mark: Mark, now: Instant) -> Awaited {
         Awaited {
             mark,

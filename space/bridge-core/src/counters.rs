@@ -77,6 +77,8 @@ pub enum Reason {
     Forged,
     /// A destination bridge has not confirmed the event in time. Its arrival is unknown.
     Unconfirmed,
+    /// A broker delivered the message after its time, or the message carries no time.
+    Late,
     /// The message is not secured, but the group is.
     Unsecured,
     /// The message is signed only, but the group encrypts; or it is encrypted and not signed.
@@ -94,7 +96,7 @@ pub enum Reason {
 
 impl Reason {
     /// All reasons in the order of their counters.
-    pub const ALL: [Self; 38] = [
+    pub const ALL: [Self; 39] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -127,6 +129,7 @@ impl Reason {
         Self::NotAsked,
         Self::Forged,
         Self::Unconfirmed,
+        Self::Late,
         Self::Unsecured,
         Self::Downgraded,
         Self::Signature,
@@ -171,6 +174,7 @@ impl Reason {
             Self::NotAsked => "not_asked",
             Self::Forged => "forged",
             Self::Unconfirmed => "unconfirmed",
+            Self::Late => "late",
             Self::Unsecured => "unsecured",
             Self::Downgraded => "downgraded",
             Self::Signature => "signature",
@@ -191,6 +195,7 @@ impl Reason {
                 | Self::Mismatch
                 | Self::Duplicate
                 | Self::Stale
+                | Self::Late
                 | Self::TooBig
                 | Self::Incomplete
                 | Self::NoRoom

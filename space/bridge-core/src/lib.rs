@@ -60,6 +60,6 @@ pub use loop_rule::{Owned, Side, What, may_cross};
 pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
 pub use room::Room;
 pub use router::Router;
-pub use settings::{Local, Now, Settings};
+pub use settings::{Local, Now, Relay, Settings};
 pub use uadp::action::{ExecutionId, Refusal};
 pub use uadp::discovery::MessageSecurityMode;

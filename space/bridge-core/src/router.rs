@@ -12,6 +12,7 @@ mod discovery;
 mod follow;
 mod guarded;
 mod held;
+mod late;
 mod own;
 mod receive;
 mod reload;
@@ -41,7 +42,7 @@ use crate::output::{Delivery, Heard, Kept, Output, PublisherKey};
 use crate::pace::Pace;
 use crate::plans::Plans;
 use crate::room::Room;
-use crate::settings::{Local, Now, Settings};
+use crate::settings::{Local, Now, Relay, Settings};
 use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message};
@@ -81,6 +82,8 @@ pub struct Router {
     claims: Option<Box<Claims>>,
     /// The secured groups; `None` without secured groups.
     guard: Option<Box<Guard>>,
+    /// The broker between the programs; `None` for a network that does not store messages.
+    relay: Option<Relay>,
     /// Whether the message in processing was received unsecured.
     in_clear: bool,
     /// The sender of the confirmations of each other space.
@@ -129,6 +132,7 @@ impl Router {
             instance: [0; 16],
             claims: None,
             guard,
+            relay: None,
             in_clear: true,
             confirmers: BTreeMap::new(),
             settled: VecDeque::new(),
@@ -775,7 +779,9 @@ impl Router {
             Some(_) => u16::try_from(Guard::OVERHEAD).unwrap_or_default(),
             None => 0,
         };
-        let max_datagram = pubsub.max_datagram.saturating_sub(room);
+        let limit = self.relay.and_then(|relay| relay.limit);
+        let most = limit.map_or(pubsub.max_datagram, |limit| limit.min(pubsub.max_datagram));
+        let max_datagram = most.saturating_sub(room);
         (max_datagram, pubsub.max_message)
     }
 

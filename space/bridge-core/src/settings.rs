@@ -1,7 +1,7 @@
 //! The settings of a Router.
 
 use std::net::SocketAddr;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use mappings::SpaceId;
 use uadp::Timestamp;
@@ -16,6 +16,18 @@ pub struct Settings {
     /// The source address of the own datagrams; an unspecified IP matches any. It is needed to
     /// detect a second bridge of the same space.
     pub source: Option<SocketAddr>,
+}
+
+/// The properties of a network with a broker, which stores messages and hides their senders.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Relay {
+    /// The age at which a received message is dropped.
+    pub within: Duration,
+    /// Whether the broker decides who may send a request. Otherwise only secured groups and calls
+    /// that are open to all may be requested.
+    pub authorized: bool,
+    /// The largest message in bytes that the broker takes, if it is known.
+    pub limit: Option<u16>,
 }
 
 /// The payload format of a local side.

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Application, Arrival, Delivery, Handover, Heard, Local, Now, Output, Reason, Router, Settings,
+    Application, Arrival, Delivery, Handover, Heard, Local, Now, Output, Reason, Relay, Router,
+    Settings,
 };
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
@@ -447,4 +448,34 @@ fn a_large_event_is_confirmed_and_sent_again_whole() {
     cell.run(Duration::from_secs(1));
     assert_eq!(cell.programs[1].got.len(), 1);
     assert_eq!(cell.arrivals(), [Arrival::Confirmed]);
+}
+
+#[test]
+fn a_command_that_a_broker_delivers_late_is_dropped_and_counted() {
+    let of = topic("ua_0_2_11");
+    for (delay, got) in [(500, vec![7]), (1500, Vec::new())] {
+        let mut cell = Cell::new(of, &[1]);
+        let relay = Relay {
+            within: Duration::from_secs(1),
+            authorized: false,
+            limit: None,
+        };
+        cell.programs[1].router.set_relay(Some(relay));
+        cell.write(of, 7);
+        let now = cell.now;
+        let held = cell.programs[0].turn(now);
+        cell.loses = Box::new(|_, _| true);
+        cell.run(Duration::from_millis(delay));
+        let now = cell.now;
+        for datagram in &held {
+            let router = &mut cell.programs[1].router;
+            router.handle_datagram(datagram, address(100), now);
+        }
+        cell.run(Duration::from_millis(50));
+        assert_eq!(cell.programs[1].got, got, "after {delay} ms");
+        let router = &cell.programs[1].router;
+        let topics = router.topics().map(|(_, of)| of.dropped(Reason::Late));
+        let late = topics.sum::<u64>() + router.others().dropped(Reason::Late);
+        assert_eq!(late > 0, got.is_empty(), "after {delay} ms");
+    }
 }

@@ -1,13 +1,16 @@
-//! Datagrams over UDP multicast and unicast.
+//! Carriers of NetworkMessages, and datagrams over UDP multicast and unicast.
 //!
-//! This crate sends and receives bytes and does not interpret datagrams. A [`Udp`] is a multicast
+//! This crate sends and receives bytes and does not interpret them. A [`Carrier`] is a PubSub
+//! network. A [`Udp`] is a multicast
 //! group (or a unicast address) on a network interface. As in OPC 10000-14, 7.3.2 (UADP over UDP),
 //! the address is used for receiving and sending.
 
+mod carrier;
 mod interface;
 mod udp;
 mod watch;
 
+pub use carrier::{BUFFER, Carrier, CarrierChange, Outgoing, Received, Senders};
 pub use interface::{Interface, InterfaceError, interfaces};
 pub use udp::{OpenError, Options, SendError, Udp};
 pub use watch::{Change, Finding, Held, LOOK};

@@ -2,8 +2,10 @@
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::task::{Context, Poll};
 
 use socket2::{Domain, Protocol, Socket, Type};
+use tokio::io::ReadBuf;
 use tokio::net::UdpSocket;
 use tracing::info;
 
@@ -211,6 +213,18 @@ impl Udp {
     /// The error of the system; the socket stays usable.
     pub async fn recv(&self, buffer: &mut [u8]) -> io::Result<(usize, SocketAddr)> {
         self.receiver.recv_from(buffer).await
+    }
+
+    /// Polls for a datagram, as [`recv`](Self::recv).
+    pub(crate) fn poll_datagram(
+        &self,
+        cx: &mut Context<'_>,
+        buffer: &mut [u8],
+    ) -> Poll<io::Result<(usize, SocketAddr)>> {
+        let mut buffer = ReadBuf::new(buffer);
+        self.receiver
+            .poll_recv_from(cx, &mut buffer)
+            .map_ok(|from| (buffer.filled().len(), from))
     }
 
     /// Returns a datagram that was already received.

@@ -27,7 +27,7 @@ use uadp::{
 use self::chunks::{Chunking, Of};
 use self::execute::{Own, Running};
 use self::learn::{Group, Known};
-use super::{About, Router};
+use super::{About, Router, late};
 use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap};
 use crate::call_announcement::{LASTING_TARGET, target_of};
 use crate::call_plan::CallPlan;
@@ -434,6 +434,10 @@ impl Router {
             let topic = TopicId::new(u16::from(space.get()), namespace, action.writer_id);
             match (topic, action.action.kind) {
                 (None, _) => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
+                (Some(topic), ActionKind::Request) if self.is_untimed(&message.header()) => {
+                    let cause = late::cause(late::UNTIMED);
+                    self.count_call(topic, Some(from), cause, || late::NO_TIME.to_owned());
+                }
                 (Some(topic), ActionKind::Request) => {
                     self.handle_request(topic, &action, from, now);
                 }
@@ -603,6 +607,7 @@ impl Router {
     }
 
     fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
+        let header = self.action_header(now);
         loop {
             let calls = self.calls.as_mut()?;
             if let Some(news) = calls.news.pop_front() {
@@ -613,10 +618,11 @@ impl Router {
             }
             let since = calls.since_start(now);
             let answer = calls.responder.poll_transmit(since);
-            let answer = answer.map(|(_, answer)| (Of::message(&answer), encode(&answer, bytes)));
+            let answer =
+                answer.map(|(_, answer)| (Of::message(&answer), encode(&answer, &header, bytes)));
             let next = answer.or_else(|| {
                 let request = calls.requestor.poll_transmit(since);
-                request.map(|request| (Of::message(&request), encode(&request, bytes)))
+                request.map(|request| (Of::message(&request), encode(&request, &header, bytes)))
             });
             match next {
                 // Timeouts that occurred in the meantime are output.
@@ -677,6 +683,7 @@ enum Told {
 /// Encodes the NetworkMessage and returns the topic of its call.
 fn encode(
     action: &ActionToSend<'_>,
+    header: &NetworkHeader<'_>,
     bytes: &mut Vec<u8>,
 ) -> (Option<TopicId>, Result<(), EncodeError>) {
     let ActionAddress {
@@ -695,7 +702,7 @@ fn encode(
         | PublisherId::String(_) => None,
     };
     let written = action
-        .encode(bytes, &NetworkHeader::default(), &Extras::default())
+        .encode(bytes, header, &Extras::default())
         .and_then(uadp::action::ActionEncoder::finish);
     (topic, written)
 }

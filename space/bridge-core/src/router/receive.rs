@@ -10,7 +10,7 @@ use uadp::{
 };
 
 use super::content::Quality;
-use super::{About, Router};
+use super::{About, Router, late};
 use crate::counters::Reason;
 use crate::fields;
 use crate::hops::Hop;
@@ -39,6 +39,12 @@ impl Router {
         now: Now,
     ) {
         let header = message.header();
+        let late = self
+            .relay
+            .and_then(|relay| relay.judge_message(sent(&header), now.utc));
+        if let Some((case, detail)) = late {
+            return self.count(About::sender(from), late::cause(case), 1, || detail);
+        }
         if self.is_for_all(message, from, now) {
             return;
         }
@@ -201,6 +207,7 @@ impl Router {
         place.fine &= message.kind == MessageKind::KeyFrame;
         place.by_clients = topic.space == SpaceId::UA;
         let local = self.settings.local;
+        let relay = self.relay;
         let Some(Topic {
             role: Role::Theirs(reader),
             counters,
@@ -213,6 +220,17 @@ impl Router {
             return;
         };
         place.held_back = *held_back;
+        let is_value = message.kind != MessageKind::KeepAlive;
+        let late = relay.filter(|_| is_value).and_then(|relay| {
+            relay.judge_value(&place, (confirming.as_deref(), *lasting), now.utc)
+        });
+        if let Some((case, detail)) = late {
+            let about = About {
+                topic: Some(topic),
+                from: Some(from),
+            };
+            return self.count(about, late::cause(case), 1, || detail);
+        }
         reader.heard(now.monotonic);
         // A keep-alive does not describe the content.
         let changed = message.kind != MessageKind::KeepAlive

@@ -99,11 +99,12 @@ impl Chunking {
     fn write(
         &mut self,
         most: usize,
+        start: &NetworkHeader<'_>,
         out: &mut Vec<u8>,
     ) -> Option<(TopicId, Result<(), ChunkError>)> {
         let large = self.waiting.front_mut()?;
         let topic = large.topic;
-        let written = large.write(most, out);
+        let written = large.write(most, start, out);
         if written.is_err() || large.offset >= large.bytes.len() {
             self.waiting.pop_front();
         }
@@ -114,7 +115,12 @@ impl Chunking {
 impl Large {
     /// Appends the next chunk. The whole NetworkMessage is split, because it contains the
     /// ActionHeader (OPC 10000-14, 7.2.4.4.4).
-    fn write(&mut self, most: usize, out: &mut Vec<u8>) -> Result<(), ChunkError> {
+    fn write(
+        &mut self,
+        most: usize,
+        start: &NetworkHeader<'_>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), ChunkError> {
         let (space, namespace, _) = self.topic.triple();
         let header = NetworkHeader {
             publisher_id: Some(PublisherId::UInt16(space)),
@@ -122,7 +128,7 @@ impl Large {
                 writer_group_id: Some(namespace),
                 ..GroupHeader::default()
             }),
-            ..NetworkHeader::default()
+            ..*start
         };
         let whole = Whole {
             message_type: NetworkMessageType::DataSet,
@@ -165,6 +171,7 @@ impl Router {
     pub(super) fn next_chunk(&mut self, now: Now) -> Option<Output> {
         let values_wait = !self.paced.is_empty();
         let most = self.most();
+        let header = self.action_header(now);
         let calls = self.calls.as_mut()?;
         let chunking = &mut calls.chunking;
         if chunking.is_empty() || !self.pace.is_open(now.monotonic) {
@@ -175,7 +182,7 @@ impl Router {
         }
         chunking.gave_way = false;
         let mut bytes = Vec::new();
-        let (topic, written) = chunking.write(most, &mut bytes)?;
+        let (topic, written) = chunking.write(most, &header, &mut bytes)?;
         match written {
             Ok(()) => {
                 self.pace.spend(bytes.len(), now.monotonic);

@@ -316,10 +316,15 @@ impl Router {
                 group: SECURED.saturating_add(at),
                 sender: from,
             },
-            None if from.ip().is_loopback() => RequestOrigin {
-                group: LOOPBACK,
-                sender: from,
-            },
+            None if self
+                .relay
+                .map_or(from.ip().is_loopback(), |relay| relay.authorized) =>
+            {
+                RequestOrigin {
+                    group: LOOPBACK,
+                    sender: from,
+                }
+            }
             None => RequestOrigin {
                 group: STRANGERS,
                 sender: SocketAddr::new(from.ip(), 0),

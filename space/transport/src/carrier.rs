@@ -1,0 +1,198 @@
+//! The interface of a PubSub network, such as UDP multicast or an MQTT broker.
+
+use std::fmt;
+use std::future::poll_fn;
+use std::io;
+use std::net::SocketAddr;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use crate::udp::{SendError, Udp};
+use crate::watch::Change;
+
+/// Sends and receives the NetworkMessages of a PubSub connection.
+///
+/// A carrier may lose, double and reorder messages. It never blocks a sender: a message that it
+/// cannot take is refused with a [`SendError`]. The interpretation of messages, including loops
+/// and repetitions, is left to the caller.
+pub trait Carrier: fmt::Debug + Send {
+    /// Sends a message without waiting.
+    ///
+    /// # Errors
+    /// A [`SendError`]; later messages may be sent nevertheless.
+    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError>;
+
+    /// Polls for a message. It is written to the start of `buffer`, which grows if needed and must
+    /// hold at least [`BUFFER`] bytes. No message is lost if the result is not awaited.
+    ///
+    /// # Errors
+    /// The error of the system; the carrier stays usable.
+    fn poll_recv(
+        &mut self,
+        cx: &mut Context<'_>,
+        buffer: &mut Vec<u8>,
+    ) -> Poll<io::Result<Received>>;
+
+    /// Returns a message that was already received; `None` if there is none.
+    fn try_recv(&mut self, buffer: &mut Vec<u8>) -> Option<io::Result<Received>>;
+
+    /// Follows changes of the network, such as a removed interface or a lost broker. Call it every
+    /// [`LOOK`](crate::LOOK).
+    fn follow(&mut self) -> Option<CarrierChange>;
+
+    /// Returns the reason why no messages are received and sent.
+    fn lost(&self) -> Option<String>;
+
+    /// Returns the source address of own messages, if they are received again. `None` if the
+    /// carrier drops them itself.
+    fn source(&self) -> Option<SocketAddr>;
+
+    /// Returns the name of the network interface or broker.
+    fn interface(&self) -> String;
+
+    /// Returns how far the carrier can tell senders apart.
+    fn senders(&self) -> Senders;
+
+    /// Returns the time after which a received message counts as late; `None` if the carrier does
+    /// not store messages.
+    fn within(&self) -> Option<Duration> {
+        None
+    }
+
+    /// Returns the largest message in bytes that the network takes, if it is known.
+    fn limit(&self) -> Option<usize> {
+        None
+    }
+
+    /// Returns the number of messages that the carrier dropped, by reason.
+    fn dropped(&self) -> Vec<(&'static str, u64)> {
+        Vec::new()
+    }
+
+    /// Starts to close the carrier: withdraws everything that the network stores.
+    fn close(&mut self) {}
+
+    /// Polls whether the carrier is closed.
+    fn poll_closed(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+        let _at_once = cx;
+        Poll::Ready(())
+    }
+}
+
+/// Size in bytes of a buffer for [`Carrier::poll_recv`]: any UDP datagram fits.
+pub const BUFFER: usize = 65_536;
+
+impl dyn Carrier + '_ {
+    /// Waits for a message, as [`poll_recv`](Carrier::poll_recv). Cancel-safe.
+    ///
+    /// # Errors
+    /// The error of the system; the carrier stays usable.
+    pub async fn recv(&mut self, buffer: &mut Vec<u8>) -> io::Result<Received> {
+        poll_fn(|cx| self.poll_recv(cx, buffer)).await
+    }
+
+    /// Waits until the carrier is closed, as [`poll_closed`](Carrier::poll_closed).
+    pub async fn closed(&mut self) {
+        poll_fn(|cx| self.poll_closed(cx)).await;
+    }
+}
+
+/// A message to send.
+#[derive(Debug, Clone, Copy)]
+pub struct Outgoing<'a> {
+    /// The NetworkMessage.
+    pub bytes: &'a [u8],
+    /// Whether a newer message of the same topic replaces the message while it waits.
+    pub replaceable: bool,
+    /// Whether the message is a command, which keeps its exact time and form.
+    pub command: bool,
+    /// The time after which the message must not be delivered any more.
+    pub within: Option<Duration>,
+}
+
+impl<'a> Outgoing<'a> {
+    /// Returns a message that is neither replaced nor expires.
+    #[must_use]
+    pub const fn new(bytes: &'a [u8]) -> Self {
+        Self {
+            bytes,
+            replaceable: false,
+            command: false,
+            within: None,
+        }
+    }
+}
+
+/// A received message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Received {
+    /// Size of the message in bytes.
+    pub length: usize,
+    /// Address of the sender, or of the broker.
+    pub from: SocketAddr,
+}
+
+/// How far a carrier can tell senders apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Senders {
+    /// Each sender has an address.
+    Addresses,
+    /// A broker hides the senders, and accepts messages from every client.
+    Hidden,
+    /// A broker hides the senders, and its access rules decide who may publish on which topic.
+    Authorized,
+}
+
+/// A change of the network of a carrier.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum CarrierChange {
+    /// Nothing is received and sent, for this reason.
+    Lost(String),
+    /// Messages are received and sent again, on this interface or broker.
+    Back(String),
+}
+
+impl Carrier for Udp {
+    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+        Self::try_send(self, message.bytes)
+    }
+
+    fn poll_recv(
+        &mut self,
+        cx: &mut Context<'_>,
+        buffer: &mut Vec<u8>,
+    ) -> Poll<io::Result<Received>> {
+        self.poll_datagram(cx, buffer)
+            .map_ok(|(length, from)| Received { length, from })
+    }
+
+    fn try_recv(&mut self, buffer: &mut Vec<u8>) -> Option<io::Result<Received>> {
+        match Self::try_recv(self, buffer) {
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => None,
+            received => Some(received.map(|(length, from)| Received { length, from })),
+        }
+    }
+
+    fn follow(&mut self) -> Option<CarrierChange> {
+        Some(match Self::follow(self)? {
+            Change::Lost(why) => CarrierChange::Lost(why),
+            Change::Back(interface) => CarrierChange::Back(interface.to_string()),
+        })
+    }
+
+    fn lost(&self) -> Option<String> {
+        Self::lost(self).map(str::to_owned)
+    }
+
+    fn source(&self) -> Option<SocketAddr> {
+        Some(Self::source(self))
+    }
+
+    fn interface(&self) -> String {
+        Self::interface(self)
+    }
+
+    fn senders(&self) -> Senders {
+        Senders::Addresses
+    }
+}
