@@ -2,6 +2,7 @@
 
 mod alarm;
 mod bindings;
+mod broker;
 mod calls;
 mod cell;
 mod confirm;

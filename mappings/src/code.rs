@@ -53,7 +53,7 @@ codes! {
     Domain = "M012", "A DDS domain is 0..232 and only a ROS 2 space has one.";
     DomainTwice = "M013", "Two spaces live in one DDS domain, so neither bridge could tell whose a topic is.";
     UndeclaredSpace = "M014", "A variable names a space that is not listed under `spaces`.";
-    Address = "M020", "The PubSub address is not `opc.udp://<IPv4 or IPv6 address>:<port>`. A host name would have to be resolved, and is not read.";
+    Address = "M020", "The PubSub address is neither `opc.udp://<IPv4 or IPv6 address>:<port>` nor `mqtt://<host>:<port>` (with TLS `mqtts://`). A host name of a UDP address would have to be resolved, and is not read. The user name and password of a broker are in a file, `mqtt: {credentials: ..}`.";
     DiscoveryGroup = "M021", "224.0.2.14 is the group OPC UA keeps for discovery messages; data sent there reaches everybody who looks for publishers.";
     UnscopedGroup = "M022", "The group is none of 239.0.0.0/8, which sites use as they like; others are assigned to protocols and may be treated by switches as such.";
     Interface = "M023", "An interface is named as the operating system does (at most 15 characters, `ip link` lists them) or by an address of it.";

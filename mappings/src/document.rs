@@ -70,9 +70,12 @@ document! {
 
     /// How values travel between the spaces.
     struct PubSubEntry {
-        /// Multicast group or unicast address and port, as opc.udp://239.192.0.40:4840 (the default).
-        #[schemars(regex(pattern = r"^opc\.udp://"))]
+        /// Multicast group or unicast address and port, as opc.udp://239.192.0.40:4840 (the default), or an MQTT broker, as
+        /// mqtt://broker.local:1883 or mqtts://broker.local:8883.
+        #[schemars(regex(pattern = r"^(opc\.udp|(opc\.)?mqtts?)://"))]
         address: String,
+        /// Settings of the MQTT broker in `address`.
+        mqtt: MqttEntry,
         /// Name or address of the network interface. Left out: the operating system chooses.
         interface: String,
         /// Hops a multicast datagram may travel. Default 1: it stays on the link.
@@ -106,6 +109,46 @@ document! {
         /// with subscribers that read only the first, as open62541 does.
         #[schemars(range(min = 1, max = 255))]
         messages_per_datagram: u16,
+    }
+
+    /// Settings of an MQTT broker. Programs that share a broker and its prefix are one space.
+    struct MqttEntry {
+        /// Version of MQTT. Default: 5.0, and 3.1.1 if the broker refuses it.
+        version: MqttVersionEntry,
+        /// First levels of every topic; default `opcua`.
+        #[schemars(length(min = 1, max = 128))]
+        prefix: String,
+        /// Message mapping of sent messages; default `uadp`. Messages of every mapping are received.
+        encoding: EncodingEntry,
+        /// Form of the topics of values: `tree` (the default), as opcua/uadp/data/1/2/10, or `names`, as opcua/ua_1_2_10.
+        topics: TopicFormEntry,
+        /// Quality of service of values that are no commands: 0 (the default) or 1. Commands and calls are always sent with 0.
+        #[schemars(range(max = 1))]
+        qos: u16,
+        /// Age at which a received message is dropped, because a broker may deliver it late; default 1s. Requires synchronised
+        /// clocks.
+        #[schemars(regex(pattern = DURATION))]
+        within: String,
+        /// Whether the access rules of the broker decide who may request calls; default false: over a broker, calls need a
+        /// secured group or `open: true`.
+        acl: bool,
+        /// PEM file with the certificates of authorities for mqtts://, relative to this file. Default: the authorities of the
+        /// system.
+        #[schemars(length(min = 1))]
+        ca: String,
+        /// PEM file with the certificate of this client, relative to this file.
+        #[schemars(length(min = 1))]
+        certificate: String,
+        /// PEM file with the key of the certificate, relative to this file.
+        #[schemars(length(min = 1))]
+        key: String,
+        /// File with the user name in its first line and the password in its second, relative to this file, that only its
+        /// owner can read (chmod 600).
+        #[schemars(length(min = 1))]
+        credentials: String,
+        /// Beginning of the ClientIds, which the programs complete so that they are unique; default `ua-bridge`.
+        #[schemars(length(min = 1, max = 32))]
+        client_id: String,
     }
 
     /// The OPC UA server of the cell.
@@ -506,6 +549,35 @@ document! {
         invert: bool,
         /// As in a binding with one field.
         out_of_range: OutOfRangeEntry,
+    }
+}
+
+choice! {
+    enum MqttVersionEntry {
+        /// MQTT 3.1.1.
+        V311 = "3.1.1",
+        /// MQTT 5.0.
+        V5 = "5.0",
+    }
+
+    enum EncodingEntry {
+        /// UADP, the binary mapping.
+        Uadp = "uadp",
+        /// JSON, Verbose: plain for readers that know the metadata.
+        JsonVerbose = "json-verbose",
+        /// JSON, Compact: every value has its type, defaults are left out.
+        JsonCompact = "json-compact",
+        /// JSON of version 1.04, reversible.
+        JsonReversible = "json-reversible",
+        /// JSON of version 1.04, non-reversible: bare values.
+        JsonNonReversible = "json-non-reversible",
+    }
+
+    enum TopicFormEntry {
+        /// The tree of OPC 10000-14, 7.3.4.7.
+        Tree = "tree",
+        /// The name of the topic in the space.
+        Names = "names",
     }
 }
 

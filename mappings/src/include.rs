@@ -300,11 +300,24 @@ impl<'a> Loader<'a> {
 /// Returns the key files that a document names. An empty path is left out, so that a finding
 /// reports it.
 fn key_files(document: &mut Document) -> impl Iterator<Item = &mut String> {
+    let pubsub = document.pubsub.as_mut().and_then(|at| at.value.as_mut());
+    let mqtt = pubsub.and_then(|pubsub| pubsub.mqtt.as_mut()?.value.as_mut());
+    let of_broker = mqtt.into_iter().flat_map(|mqtt| {
+        let files = [
+            &mut mqtt.ca,
+            &mut mqtt.certificate,
+            &mut mqtt.key,
+            &mut mqtt.credentials,
+        ];
+        files
+            .into_iter()
+            .filter_map(|file| file.as_mut()?.value.as_mut())
+    });
     let groups = document.security.as_mut().and_then(|at| at.value.as_mut());
     let groups = groups.into_iter().flatten();
     let keys = groups.filter_map(|at| at.value.as_mut()?.keys.as_mut()?.value.as_mut());
     let files = keys.filter_map(|keys| keys.file.as_mut()?.value.as_mut());
-    files.filter(|file| !file.is_empty())
+    files.chain(of_broker).filter(|file| !file.is_empty())
 }
 
 /// Returns the value of a faulty entry.

@@ -1,6 +1,7 @@
 //! Names of the space, and the YAML document that ties them to ROS topics and OPC UA nodes.
 
 mod alarm;
+mod broker;
 mod call;
 mod check;
 mod code;
@@ -34,6 +35,7 @@ mod unit;
 mod variables;
 
 pub use alarm::{Alarm, AlarmLimits, AlarmTrigger, AlarmValue};
+pub use broker::{Broker, BrokerAddress, MessageMapping, MqttVersion, TopicForm};
 pub use call::{
     Assigned, Assignment, Call, CallBinding, CallKind, CallTarget, ExecutedBy, FieldMap,
     MethodTarget,

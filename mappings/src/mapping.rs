@@ -10,6 +10,7 @@ use messages::{Leaf, Selection, TypeName};
 use uadp::BuiltinType;
 
 use crate::alarm::Alarm;
+use crate::broker::Broker;
 use crate::call::{Call, CallBinding};
 use crate::endpoint::Endpoint;
 use crate::loss::Loss;
@@ -345,6 +346,8 @@ pub enum Trigger {
 pub struct PubSub {
     /// Group or host that NetworkMessages are sent to, and its UDP port.
     pub address: SocketAddr,
+    /// MQTT broker that carries the messages instead of UDP.
+    pub broker: Option<Box<Broker>>,
     /// Name or address of the network interface; `None` lets the operating system choose.
     pub interface: Option<String>,
     /// Hops a multicast datagram may travel; 1 stays on the link.
@@ -407,6 +410,7 @@ impl Default for PubSub {
     fn default() -> Self {
         Self {
             address: Self::ADDRESS,
+            broker: None,
             interface: None,
             ttl: 1,
             publisher_id: PublisherIdRule::Exact,

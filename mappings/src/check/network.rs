@@ -5,7 +5,8 @@ use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use super::cell::is_uri;
-use super::permissions;
+use super::{broker, permissions};
+use crate::broker::BrokerAddress;
 use crate::code::Code;
 use crate::document::{
     HistoryEntry, LimitsEntry, PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry,
@@ -23,7 +24,10 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
     let Some(entry) = entry.and_then(|at| at.value.as_ref()) else {
         return default;
     };
-    let address = given(&entry.address).and_then(|(text, place)| address(text, place, findings));
+    let broker = broker::check(entry, findings);
+    let address = given(&entry.address)
+        .filter(|(text, _)| !BrokerAddress::is_mqtt(text))
+        .and_then(|(text, place)| address(text, place, findings));
     let interface =
         given(&entry.interface).and_then(|(text, place)| interface(text, place, findings));
     let ttl = given(&entry.ttl).and_then(|(number, place)| {
@@ -50,6 +54,7 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
     let together = within(&entry.messages_per_datagram, 1..=255, "messages", findings);
     let pubsub = PubSub {
         address: address.unwrap_or(default.address),
+        broker,
         interface,
         ttl: ttl.unwrap_or(default.ttl),
         publisher_id,
@@ -125,8 +130,9 @@ fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAd
             note = note.label("it has no user name or password");
         }
         note.help(format!(
-            "a group or host by number: opc.udp://{}",
-            PubSub::ADDRESS
+            "a group or host by number, opc.udp://{}, or a broker, {}",
+            PubSub::ADDRESS,
+            BrokerAddress::EXAMPLE
         ));
         return None;
     };

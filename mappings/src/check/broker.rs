@@ -1,0 +1,129 @@
+//! The MQTT broker.
+
+use std::path::PathBuf;
+
+use super::network::{duration, within};
+use crate::broker::{Broker, BrokerAddress, MessageMapping, MqttVersion, TopicForm};
+use crate::code::Code;
+use crate::document::{EncodingEntry, MqttEntry, MqttVersionEntry, PubSubEntry, TopicFormEntry};
+use crate::findings::Findings;
+use crate::read::{Field, given, short};
+use crate::secret::has_user;
+
+/// Returns the broker of the mapping; `None` if the messages are carried by UDP.
+pub(super) fn check(entry: &PubSubEntry, findings: &mut Findings) -> Option<Box<Broker>> {
+    let address = given(&entry.address).filter(|(text, _)| BrokerAddress::is_mqtt(text));
+    let Some((text, place)) = address else {
+        if let Some(at) = &entry.mqtt {
+            let note = findings.error(
+                Code::Address,
+                at.place,
+                "`mqtt` needs the address of a broker",
+            );
+            note.help(format!("address: {}", BrokerAddress::EXAMPLE));
+        }
+        return None;
+    };
+    let Some(address) = BrokerAddress::parse(text) else {
+        let message = format!("`{}` is no address of a broker", short(text));
+        let mut note = findings.error(Code::Address, place, message);
+        if has_user(text) {
+            note =
+                note.label("user name and password belong into a file: `mqtt: {credentials: ..}`");
+        }
+        note.help(format!("for example {}", BrokerAddress::EXAMPLE));
+        return None;
+    };
+    let mut broker = Broker::new(address);
+    let Some((mqtt, _)) = given(&entry.mqtt) else {
+        return Some(Box::new(broker));
+    };
+    broker.version = given(&mqtt.version).map(|(version, _)| match version {
+        MqttVersionEntry::V311 => MqttVersion::V3_1_1,
+        MqttVersionEntry::V5 => MqttVersion::V5,
+    });
+    broker.encoding = match given(&mqtt.encoding) {
+        None | Some((EncodingEntry::Uadp, _)) => MessageMapping::Uadp,
+        Some((EncodingEntry::JsonVerbose, _)) => MessageMapping::JsonVerbose,
+        Some((EncodingEntry::JsonCompact, _)) => MessageMapping::JsonCompact,
+        Some((EncodingEntry::JsonReversible, _)) => MessageMapping::JsonReversible,
+        Some((EncodingEntry::JsonNonReversible, _)) => MessageMapping::JsonNonReversible,
+    };
+    broker.topics = match given(&mqtt.topics) {
+        Some((TopicFormEntry::Names, _)) => TopicForm::Names,
+        Some((TopicFormEntry::Tree, _)) | None => TopicForm::Tree,
+    };
+    if let Some(prefix) = levels(&mqtt.prefix, findings) {
+        broker.prefix = prefix;
+    }
+    broker.client_id = levels(&mqtt.client_id, findings);
+    broker.at_least_once = within(&mqtt.qos, 0..=1, "for qos", findings) == Some(1);
+    broker.within = duration(&mqtt.within, findings).unwrap_or(Broker::WITHIN);
+    broker.acl = given(&mqtt.acl).is_some_and(|(set, _)| *set);
+    files(mqtt, &mut broker, findings);
+    Some(Box::new(broker))
+}
+
+/// Sets the files for TLS and for the log-in.
+fn files(mqtt: &MqttEntry, broker: &mut Broker, findings: &mut Findings) {
+    let path = |field: &Field<String>| given(field).map(|(file, _)| PathBuf::from(file));
+    broker.ca = path(&mqtt.ca);
+    broker.credentials = path(&mqtt.credentials);
+    broker.client = match (path(&mqtt.certificate), path(&mqtt.key)) {
+        (Some(certificate), Some(key)) => Some((certificate, key)),
+        (None, None) => None,
+        (certificate, _) => {
+            let (at, missing) = match certificate {
+                Some(_) => (&mqtt.certificate, "key"),
+                None => (&mqtt.key, "certificate"),
+            };
+            if let Some(at) = at {
+                let message = format!("a client certificate needs `{missing}` too");
+                findings
+                    .error(Code::MissingKey, at.place, message)
+                    .help("certificate: client.pem, key: client.key");
+            }
+            None
+        }
+    };
+    if broker.address.tls {
+        return;
+    }
+    for at in [&mqtt.ca, &mqtt.certificate].into_iter().flatten() {
+        let note = findings.error(
+            Code::Address,
+            at.place,
+            "certificates are used with mqtts:// only",
+        );
+        note.help(format!("address: mqtts://{}:8883", broker.address.host));
+    }
+    if let Some(at) = &mqtt.credentials
+        && !is_loopback(&broker.address.host)
+    {
+        let message = "the password is sent unencrypted";
+        let note = findings.warning(Code::Address, at.place, message);
+        note.help(format!("address: mqtts://{}:8883", broker.address.host));
+    }
+}
+
+fn is_loopback(host: &str) -> bool {
+    host == "localhost"
+        || host
+            .parse()
+            .is_ok_and(|ip: std::net::IpAddr| ip.is_loopback())
+}
+
+/// Reads levels of a topic.
+fn levels(field: &Field<String>, findings: &mut Findings) -> Option<String> {
+    let (text, place) = given(field)?;
+    let is_plain = |c: char| !c.is_control() && !c.is_whitespace() && !matches!(c, '+' | '#');
+    let is_level = |level: &str| !level.is_empty() && !level.starts_with('$');
+    if text.len() <= 128 && text.chars().all(is_plain) && text.split('/').all(is_level) {
+        return Some(text.clone());
+    }
+    let message = format!("`{}` cannot be part of an MQTT topic", short(text));
+    findings
+        .error(Code::WrongValue, place, message)
+        .help("letters, digits and `/` between levels, as plant/cell-4");
+    None
+}
