@@ -74,6 +74,14 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 65 the file has no keys, 74 the file cannot be read or
     /// written, or exists.
     Keys(MakeKeys),
+    /// Write the access rules of an MQTT broker for a mapping
+    ///
+    /// Prints an `acl_file` of mosquitto: a user for each space, which may write the messages of its
+    /// space only, and a user for `ua-space`.
+    ///
+    /// Exit codes: 0 done, 64 the mapping names no broker, 65 the mapping cannot be read, 74 the
+    /// file cannot be read or the output cannot be written.
+    Acl(Acl),
     /// Show the contents of a datagram, or of each datagram of a capture
     ///
     /// Reads a datagram as hexadecimal text or as its bytes, or the UDP datagrams of a pcap or
@@ -353,6 +361,13 @@ pub(crate) struct Explain {
     /// Such as M014
     #[arg(value_name = "CODE")]
     pub(crate) code: Option<Code>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Acl {
+    /// The mapping of the cell
+    #[arg(value_name = "MAPPING")]
+    pub(crate) mapping: PathBuf,
 }
 
 #[derive(Debug, Args)]

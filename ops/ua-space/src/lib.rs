@@ -1,5 +1,6 @@
 //! `ua-space`: shows, checks and calls the contents of a running space.
 
+mod acl;
 mod actions;
 mod arguments;
 mod ask;
@@ -19,7 +20,6 @@ mod hex;
 mod http;
 mod init;
 mod input;
-mod iso_time;
 mod json_file;
 mod keys;
 mod layout;
@@ -28,7 +28,6 @@ mod make_keys;
 mod messages;
 mod metadata;
 mod new;
-mod node_ids;
 mod packet;
 mod page;
 mod raw_data;
@@ -37,11 +36,9 @@ mod selector;
 mod session;
 mod shape;
 mod source;
-mod status;
-mod structures;
 mod survey;
-mod values;
 
+use json_values::{self as values, iso_time, node_ids, status};
 use std::ffi::OsString;
 use std::process::ExitCode;
 
@@ -74,6 +71,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Explain(arguments) => explain::explain(arguments),
         Verb::Schema => explain::schema(),
         Verb::Keys(arguments) => make_keys::make_keys(arguments),
+        Verb::Acl(arguments) => acl::acl(arguments),
         Verb::Decode(arguments) => session::decode(arguments),
         Verb::Encode(arguments) => session::encode(arguments),
         Verb::Discover(arguments) => discover::discover(arguments),

@@ -5,6 +5,7 @@ mod application;
 mod bandwidth;
 mod book;
 mod call;
+mod carrier;
 mod described;
 mod echo;
 mod list;
@@ -25,6 +26,7 @@ pub(crate) use all::list;
 pub(crate) use application::Application;
 pub(crate) use bandwidth::bandwidth;
 pub(crate) use call::call;
+pub(crate) use carrier::broker_mapping;
 pub(crate) use echo::{echo, hz};
 pub(crate) use list::{info, json};
 pub(crate) use seen::{Timing, TopicSeen, listened};
@@ -37,11 +39,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use mappings::{PubSub, SpaceId, TopicId};
+use mappings::{SpaceId, TopicId};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::Instant;
-use transport::{Options, Udp};
-use uadp::NetworkMessage;
+use transport::{BUFFER, Carrier, Outgoing, Received};
+use uadp::{NetworkHeader, NetworkMessage, Timestamp};
 
 use crate::arguments::Group;
 use crate::exit::Failure;
@@ -53,7 +55,7 @@ use sealing::Sealing;
 
 /// A connection to the group.
 pub(crate) struct Live {
-    udp: Udp,
+    carrier: Box<dyn Carrier>,
     /// The origin of its times.
     start: Instant,
     /// The same instant in nanoseconds since 1970.
@@ -66,7 +68,7 @@ pub(crate) struct Live {
     buffer: Vec<u8>,
     /// The keys of a secured group.
     sealing: Option<Sealing>,
-    shown_group: SocketAddr,
+    shown_group: String,
 }
 
 /// The reason why listening ended.
@@ -118,23 +120,12 @@ pub(crate) async fn in_the_group(group: &Group, seconds: f64) -> Result<(InGroup
 
 impl Live {
     fn join(group: &Group) -> Result<Self, Failure> {
-        let address = match &group.address {
-            None => PubSub::ADDRESS,
-            Some(url) => PubSub::parse_address(url).ok_or_else(|| {
-                let example = PubSub::ADDRESS;
-                Failure::Usage(format!("--address {url}: for example opc.udp://{example}"))
-            })?,
-        };
-        let options = Options {
-            interface: group.interface.clone(),
-            ..Options::new(address)
-        };
-        let udp = Udp::open(&options).map_err(|error| Failure::Unavailable(error.to_string()))?;
+        let (carrier, shown_group) = carrier::open(group)?;
         let on = |kind| {
             signal(kind).map_err(|error| Failure::Io(format!("cannot catch signals: {error}")))
         };
         Ok(Self {
-            udp,
+            carrier,
             start: Instant::now(),
             start_utc: unix_nanos(),
             book: Book::new(),
@@ -142,12 +133,12 @@ impl Live {
             wants_calls: false,
             interrupt: on(SignalKind::interrupt())?,
             terminate: on(SignalKind::terminate())?,
-            buffer: vec![0; 65_536],
+            buffer: vec![0; BUFFER],
             sealing: match &group.keys {
                 Some(path) => Some(Sealing::read(path, group.sign)?),
                 None => None,
             },
-            shown_group: address,
+            shown_group,
         })
     }
 
@@ -180,8 +171,8 @@ impl Live {
     }
 
     /// Returns the address of the group for output.
-    pub(crate) const fn group(&self) -> SocketAddr {
-        self.shown_group
+    pub(crate) fn group(&self) -> &str {
+        &self.shown_group
     }
 
     /// Probes for the calls of all received spaces and of the given spaces.
@@ -209,13 +200,32 @@ impl Live {
         self.prober.insist(space, writer_id, self.start.elapsed());
     }
 
+    /// Returns the header of a request. Executors drop requests over a broker without the time of
+    /// sending.
+    pub(crate) fn action_header(&self) -> NetworkHeader<'static> {
+        if self.carrier.within().is_none() {
+            return NetworkHeader::default();
+        }
+        let elapsed = i128::try_from(self.now().as_nanos()).unwrap_or(i128::MAX);
+        let now = Timestamp::from_unix_nanos(self.start_utc.saturating_add(elapsed));
+        NetworkHeader {
+            timestamp: Some(now.time),
+            picoseconds: Some(now.picoseconds),
+            ..NetworkHeader::default()
+        }
+    }
+
     pub(crate) fn send(&mut self, datagram: &[u8]) {
         let sealed = self.sealing.as_mut().map(|sealing| sealing.seal(datagram));
         let sent = match sealed.transpose() {
             Ok(sealed) => {
                 let datagram = sealed.as_deref().unwrap_or(datagram);
-                self.udp
-                    .try_send(datagram)
+                let message = Outgoing {
+                    within: self.carrier.within(),
+                    ..Outgoing::new(datagram)
+                };
+                self.carrier
+                    .try_send(&message)
                     .map_err(|error| error.to_string())
             }
             Err(error) => Err(error),
@@ -241,7 +251,10 @@ impl Live {
                 self.probe_what_is_due(now);
             }
             if now >= until {
-                return Ok(Ended::Time);
+                return match self.carrier.lost() {
+                    Some(why) => Err(Failure::Unavailable(why)),
+                    None => Ok(Ended::Time),
+                };
             }
             if let Some(ended) = self.step(until.min(now + LOOK), each).await? {
                 return Ok(ended);
@@ -261,8 +274,8 @@ impl Live {
             Some(()) = self.interrupt.recv() => Ok(Some(Ended::Interrupted)),
             Some(()) = self.terminate.recv() => Ok(Some(Ended::Interrupted)),
             () = tokio::time::sleep_until(until) => Ok(None),
-            received = self.udp.recv(&mut self.buffer) => {
-                let (length, from) = received
+            received = self.carrier.recv(&mut self.buffer) => {
+                let Received { length, from } = received
                     .map_err(|error| Failure::Io(format!("cannot hear the group: {error}")))?;
                 let datagram = self.buffer.get(..length).unwrap_or_default();
                 let sealing = self.sealing.as_mut();
@@ -295,6 +308,9 @@ impl Live {
     }
 
     fn probe_what_is_due(&mut self, now: Duration) {
+        if self.carrier.lost().is_some() {
+            return;
+        }
         if let Some(datagram) = self.prober.poll(now) {
             self.send(&datagram);
         }

@@ -10,8 +10,8 @@ use uadp::{
 use crate::arguments::RawReading;
 use crate::fault::{Stop, in_field};
 use crate::node_ids::OwnedNodeId;
-use crate::shape::{Field, FieldMetaData, FieldValue};
-use crate::values::{WrongValue, show_scalar, show_variant, variant_bytes};
+use crate::shape::{Field, FieldMetaData};
+use crate::values::{FieldValue, WrongValue, show_scalar, show_variant, variant_bytes};
 
 /// The fields of a DataSet, with the properties that RawData uses.
 #[derive(Debug)]

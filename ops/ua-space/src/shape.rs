@@ -1,6 +1,7 @@
 //! The JSON of a datagram, key by key. Absent or null keys are not on the wire. There are no keys
 //! for flags, because the flags follow from the present keys.
 
+use json_values::FieldValue;
 use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -406,41 +407,4 @@ pub(crate) struct Field {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) index: Option<u16>,
     pub(crate) value: FieldValue,
-}
-
-/// A Variant, or a DataValue with status and timestamps. UaType 0 is the null Variant, an absent
-/// UaType is a DataValue without value.
-#[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "PascalCase", deny_unknown_fields, default)]
-pub(crate) struct FieldValue {
-    /// Number of the builtin type.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) ua_type: Option<u8>,
-    /// The value; for an array the elements in order, with the last dimension varying fastest.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) value: Option<Value>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) dimensions: Option<Vec<u32>>,
-    /// True if the array is null, which differs from an empty array.
-    #[serde(skip_serializing_if = "std::ops::Not::not")]
-    pub(crate) null_array: bool,
-    #[serde(alias = "StatusCode", skip_serializing_if = "Option::is_none")]
-    pub(crate) status: Option<Status>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) source_timestamp: Option<String>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) source_picoseconds: Option<u16>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) server_timestamp: Option<String>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) server_picoseconds: Option<u16>,
-}
-
-#[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "PascalCase", deny_unknown_fields)]
-pub(crate) struct Status {
-    pub(crate) code: u32,
-    /// The name of the code, for people.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) symbol: Option<String>,
 }

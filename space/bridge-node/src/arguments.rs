@@ -32,7 +32,7 @@ pub struct Flags {
     /// The network interface of the PubSub group, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     pub interface: Option<String>,
-    /// The PubSub group, as opc.udp://239.192.0.40:4840
+    /// The PubSub group, as opc.udp://239.192.0.40:4840, or an MQTT broker, as mqtt://broker.local:1883
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub address: Option<String>,
     /// Take the secured groups of this mapping YAML, its key `security`, in place of those of the own configuration

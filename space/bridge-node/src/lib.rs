@@ -10,6 +10,7 @@ mod arguments;
 mod awaited;
 mod busy_poll;
 mod calls;
+mod carrier;
 mod clock;
 mod definitions;
 mod descriptors;

@@ -11,17 +11,18 @@ use std::time::Duration;
 
 use bridge_core::{Application, Local, Owned, Router, Settings};
 use clap::Parser;
-use mappings::{Mapping, PubSub, SecurityGroup, SpaceId};
+use mappings::{Mapping, SecurityGroup, SpaceId};
 use tokio::signal::unix::SignalKind;
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tracing::{Instrument, Span, error, info, info_span};
-use transport::{Held, Options, Udp};
+use transport::Held;
 use type_files::TypePaths;
 
 use crate::arguments::Arguments;
 use crate::awaited::PeerWatch;
 use crate::busy_poll::BusyPoll;
+use crate::carrier;
 use crate::clock::now;
 use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
@@ -32,7 +33,7 @@ use crate::metrics::{self, Requests, Site};
 use crate::observer::Observer;
 use crate::port::Port;
 use crate::restart;
-use crate::run::{Fixed, Shell};
+use crate::run::{Fixed, Shell, relay};
 use crate::service;
 use crate::service_manager;
 use crate::signals;
@@ -269,19 +270,18 @@ async fn prepare<P: Program>(
         "{} starts",
         P::NAME
     );
-    let options = options(arguments, &mapping, several)?;
-    let udp = Udp::open(&options)
-        .map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
+    let (carrier, group) = carrier::open((P::NAME, own), (arguments, &mapping), several)?;
     let settings = Settings {
         own,
         local: P::LOCAL,
-        source: Some(udp.source()),
+        source: Some(carrier.source().unwrap_or(carrier::NO_SOURCE)),
     };
     let mut keys = KeyRing::new(groups(arguments)?, program.key_service(&mapping));
     let taken = mapping;
     let mapping = keys.applied(Arc::clone(&taken));
     let mut router = Router::new(settings, Arc::clone(&mapping));
     router.set_owned(P::owned(&mapping), now());
+    router.set_relay(relay(carrier.as_ref()));
     router.set_instance(instance()?);
     keys.start(&mapping, &mut router)?;
     router.call_the_roll(now());
@@ -297,11 +297,13 @@ async fn prepare<P: Program>(
     let port = program.start(context).await?;
     let application = port.application();
     let application = application.unwrap_or_else(|| plain(P::NAME, own));
-    let told = program.tell(&Carried {
-        application: &application,
-        own,
-        group: options.address,
-        interface: options.interface.as_deref(),
+    let told = group.and_then(|options| {
+        program.tell(&Carried {
+            application: &application,
+            own,
+            group: options.address,
+            interface: options.interface.as_deref(),
+        })
     });
     router.introduce(application, now());
     Ok(Shell {
@@ -312,7 +314,7 @@ async fn prepare<P: Program>(
         router,
         held: port.addresses().and_then(Held::start),
         port,
-        udp,
+        carrier,
         owned: P::owned,
         claims: P::CLAIMS,
         requests,
@@ -399,33 +401,4 @@ fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Fail
             format!("the program broke off: {error}"),
         ))
     })
-}
-
-/// Returns the socket options for the group.
-fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Options, Failure> {
-    let pubsub = mapping.pubsub();
-    let address: SocketAddr = match &arguments.flags.address {
-        Some(url) => PubSub::parse_address(url).ok_or_else(|| {
-            let message = format!("--address {url}: for example opc.udp://{}", PubSub::ADDRESS);
-            Failure::new(FailureKind::Usage, message)
-        })?,
-        None => pubsub.address,
-    };
-    let options = Options {
-        interface: arguments
-            .flags
-            .interface
-            .clone()
-            .or_else(|| pubsub.interface.clone()),
-        ttl: u32::from(pubsub.ttl),
-        ..Options::new(address)
-    };
-    if several && !address.ip().is_multicast() {
-        let message = format!(
-            "several spaces in one program hear each other by multicast, and {address} is no multicast address: start \
-             a program for each"
-        );
-        return Err(Failure::new(FailureKind::Usage, message));
-    }
-    Ok(options)
 }

@@ -11,13 +11,15 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, Notice, Output, Owned, Reason, Router};
+use bridge_core::{Heard, Notice, Output, Owned, Reason, Relay, Router};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, MissedTickBehavior, Sleep, interval};
 use tracing::{debug, info, warn};
-use transport::{Change, Finding, Held, SendError, Udp};
+use transport::{
+    BUFFER, Carrier, CarrierChange, Finding, Held, Outgoing, Received, SendError, Senders,
+};
 use uadp::Timestamp;
 
 use crate::awaited::PeerWatch;
@@ -32,7 +34,7 @@ use crate::policy::NO_SUBSCRIBER;
 use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, Status};
 
-/// The run loop of one space, with its Router, port and socket, and the requests for the status.
+/// The run loop of one space, with its Router, port and carrier, and the requests for the status.
 pub(crate) struct Shell<P> {
     pub(crate) program: &'static str,
     /// The start of the program.
@@ -42,7 +44,7 @@ pub(crate) struct Shell<P> {
     pub(crate) own: SpaceId,
     pub(crate) router: Router,
     pub(crate) port: P,
-    pub(crate) udp: Udp,
+    pub(crate) carrier: Box<dyn Carrier>,
     /// The network interfaces that the port cannot change while it runs.
     pub(crate) held: Option<Held>,
     /// Returns the namespaces that only this program writes, by the mapping.
@@ -97,6 +99,7 @@ impl Fixed {
                 self.interface && was.interface != is.interface,
             ),
             ("pubsub.ttl", was.ttl != is.ttl),
+            ("pubsub.mqtt", was.broker != is.broker),
         ];
         let differing = keys.into_iter().filter(|(_, differs)| *differs);
         differing.map(|(key, _)| key.to_owned()).collect()
@@ -123,6 +126,7 @@ impl<P: Port> Shell<P> {
         }
         self.log_unknown_outcomes();
         self.log_end();
+        self.close().await;
         self.port.shutdown().await;
         ended
     }
@@ -151,8 +155,7 @@ impl<P: Port> Shell<P> {
         let mut timer = pin!(tokio::time::sleep(FAR));
         let mut looks = interval(transport::LOOK);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        // Any UDP datagram fits.
-        let mut buffer = vec![0; 65_536];
+        let mut buffer = vec![0; BUFFER];
         let mut more = false;
         loop {
             if phase == Phase::Closing && self.port.pending().is_empty() {
@@ -165,7 +168,7 @@ impl<P: Port> Shell<P> {
                 // near.
                 () = tokio::task::yield_now(), if yields => {}
                 () = &mut stop => return Ok(()),
-                heard = self.udp.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
+                heard = self.carrier.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
                 event = self.port.recv() => more = self.port_events(event).await?,
                 () = timer.as_mut() => self.router.handle_timeout(now()),
                 _ = looks.tick() => {
@@ -189,20 +192,16 @@ impl<P: Port> Shell<P> {
     /// Handles a datagram and the datagrams queued behind it, up to a limit, and carries out each
     /// before the next is read. Under a flood, the other branches are then polled once for many
     /// datagrams. Returns whether more datagrams may be queued.
-    fn heard_all(
-        &mut self,
-        first: io::Result<(usize, std::net::SocketAddr)>,
-        buffer: &mut [u8],
-    ) -> bool {
+    fn heard_all(&mut self, first: io::Result<Received>, buffer: &mut Vec<u8>) -> bool {
         let mut heard = first;
         for _ in 0..TAKEN_AT_ONCE {
             self.heard(heard, buffer);
             if self.drain() {
                 return true;
             }
-            match self.udp.try_recv(buffer) {
-                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return false,
-                next => heard = next,
+            match self.carrier.try_recv(buffer) {
+                None => return false,
+                Some(next) => heard = next,
             }
         }
         // The last datagram was read and must not be lost.
@@ -249,7 +248,7 @@ impl<P: Port> Shell<P> {
 
     fn status(&self) -> Status {
         let about = Arc::clone(&self.changes.borrow().about);
-        let lost = self.udp.lost().map(group_lost);
+        let lost = self.carrier.lost().map(group_lost);
         let interfaces = Interfaces {
             pubsub: u8::from(lost.is_none()),
             local: self
@@ -278,6 +277,7 @@ impl<P: Port> Shell<P> {
         .with_links(self.port.links())
         .with_certificate(self.port.certificate())
         .with_pending(self.port.pending())
+        .with_carrier(self.carrier.interface(), self.carrier.dropped())
     }
 
     /// Returns the messages about secured groups without keys.
@@ -289,14 +289,19 @@ impl<P: Port> Shell<P> {
 
     /// Follows the changes of the network interface of the group.
     fn follow_group(&mut self) {
-        match self.udp.follow() {
+        match self.carrier.follow() {
             None => {}
-            Some(Change::Lost(why)) => {
-                let lost = group_lost(&why);
+            Some(CarrierChange::Lost(why)) => {
+                let lost = group_lost(why);
                 warn!("{lost}; it is waited for, and nothing crosses meanwhile");
             }
-            Some(Change::Back(interface)) => {
-                self.router.set_source(self.udp.source());
+            Some(CarrierChange::Back(interface)) => {
+                if let Some(source) = self.carrier.source() {
+                    self.router.set_source(source);
+                }
+                self.router.set_relay(relay(self.carrier.as_ref()));
+                // The probes of the start may have been lost.
+                self.router.call_the_roll(now());
                 info!(%interface, "the PubSub network is within reach: hearing and sending there again");
             }
         }
@@ -363,10 +368,10 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    fn heard(&mut self, heard: io::Result<(usize, std::net::SocketAddr)>, buffer: &[u8]) {
+    fn heard(&mut self, heard: io::Result<Received>, buffer: &[u8]) {
         match heard {
-            Ok((len, from)) => {
-                let datagram = buffer.get(..len).unwrap_or_default();
+            Ok(Received { length, from }) => {
+                let datagram = buffer.get(..length).unwrap_or_default();
                 let now = now();
                 self.busy.arrived(now.monotonic);
                 self.observe(|observer| observer.datagram(datagram, from));
@@ -474,7 +479,13 @@ impl<P: Port> Shell<P> {
             };
             match output {
                 Output::Datagram { topic, with, bytes } => {
-                    if let Err(error) = self.send(&bytes) {
+                    let message = Outgoing {
+                        bytes: &bytes,
+                        replaceable: with.is_empty() && self.router.is_state(topic),
+                        command: self.router.is_command(topic),
+                        within: self.router.expiry(topic),
+                    };
+                    if let Err(error) = self.send(&message) {
                         let (reason, detail) = (not_sent(error), error.to_string());
                         for topic in std::iter::once(topic).chain(with) {
                             self.router.not_sent(topic, reason, &detail);
@@ -483,7 +494,7 @@ impl<P: Port> Shell<P> {
                     self.router.recycle(bytes);
                 }
                 Output::Discovery { bytes } => {
-                    if let Err(error) = self.send(&bytes) {
+                    if let Err(error) = self.send(&Outgoing::new(&bytes)) {
                         self.router
                             .not_announced(not_sent(error), &error.to_string());
                     }
@@ -542,25 +553,34 @@ impl<P: Port> Shell<P> {
     }
 
     /// Sends the probes of the observer.
-    fn send_probes(&self) {
-        let Some(observer) = &self.observer else {
+    fn send_probes(&mut self) {
+        let Some(observer) = self.observer.clone() else {
             return;
         };
         for _ in 0..MOST_PROBES {
             let Some(probe) = observer.probe() else {
                 return;
             };
-            if let Err(error) = self.send(&probe) {
+            if let Err(error) = self.send(&Outgoing::new(&probe)) {
                 debug!(%error, "a probe was not sent");
             }
         }
     }
 
-    fn send(&self, datagram: &[u8]) -> Result<(), SendError> {
+    fn send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
         if self.dry_run {
             return Ok(());
         }
-        self.udp.try_send(datagram)
+        self.carrier.try_send(message)
+    }
+
+    /// Withdraws everything that the network stores.
+    async fn close(&mut self) {
+        self.carrier.close();
+        let closed = self.carrier.closed();
+        if tokio::time::timeout(CLOSING, closed).await.is_err() {
+            debug!("the PubSub network did not confirm the end");
+        }
     }
 
     fn deliver(&mut self, delivery: bridge_core::Delivery) {
@@ -612,7 +632,18 @@ impl<P: Port> Shell<P> {
     }
 }
 
-fn group_lost(why: &str) -> String {
+/// Returns the properties of the broker, if the carrier uses one.
+pub(crate) fn relay(carrier: &dyn Carrier) -> Option<Relay> {
+    Some(Relay {
+        within: carrier.within()?,
+        authorized: carrier.senders() == Senders::Authorized,
+        limit: carrier
+            .limit()
+            .map(|limit| u16::try_from(limit).unwrap_or(u16::MAX)),
+    })
+}
+
+fn group_lost(why: String) -> String {
     format!("the PubSub network is out of reach: {why}")
 }
 
@@ -650,5 +681,7 @@ const TAKEN_AT_ONCE: usize = 32;
 const MOST_PROBES: usize = 8;
 /// How long the end of the program waits for pending cancellations.
 const PENDING_AT_END: Duration = Duration::from_secs(5);
+/// How long the end of the program waits for the network.
+const CLOSING: Duration = Duration::from_secs(2);
 /// A deadline for when there is nothing to wait for.
 const FAR: Duration = Duration::from_secs(3600);

@@ -42,6 +42,9 @@ pub(crate) struct Status {
     /// Other applications of the group, as they describe themselves.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     applications: Vec<ApplicationStatus>,
+    /// The broker, if messages are carried by one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    broker: Option<BrokerStatus>,
     /// Datagrams and messages without a topic.
     others: TopicStatus,
     hops: BTreeMap<&'static str, HopStatus>,
@@ -74,6 +77,13 @@ struct ApplicationStatus {
     name: String,
     urls: Vec<String>,
     capabilities: Vec<String>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct BrokerStatus {
+    address: String,
+    /// Messages that were not passed on, by reason.
+    dropped: BTreeMap<&'static str, u64>,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -203,6 +213,7 @@ impl Status {
             certificate: None,
             cancellations_pending: Vec::new(),
             applications: applications(router),
+            broker: None,
             others: router.others().into(),
             hops,
         }
@@ -240,6 +251,18 @@ impl Status {
             Some(format!("ua_topic_info{{{own},{labels}}} 1\n"))
         });
         named.collect()
+    }
+
+    pub(crate) fn with_carrier(
+        mut self,
+        address: String,
+        dropped: Vec<(&'static str, u64)>,
+    ) -> Self {
+        self.broker = (!dropped.is_empty()).then(|| BrokerStatus {
+            address,
+            dropped: dropped.into_iter().collect(),
+        });
+        self
     }
 
     /// Returns the number of topics, and the numbers of samples sent, delivered and dropped.
@@ -360,6 +383,10 @@ impl Told for Status {
                     count,
                 );
             }
+        }
+        for (reason, count) in self.broker.iter().flat_map(|broker| &broker.dropped) {
+            let labels = format!("{own},reason=\"{reason}\"");
+            line("broker_dropped_total", &labels, count);
         }
         let pending = self.cancellations_pending.len();
         line("cancellations_pending", &own, &pending);

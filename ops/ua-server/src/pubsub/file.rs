@@ -20,7 +20,7 @@ use opcua::types::{
 use plant_opcua::file::{Answer, FileMethod, READ};
 use plant_opcua::server::{CoreMethod, MethodRequest, method};
 
-use super::insert::{self, DATA_SET_MESSAGE, NETWORK_MESSAGE, UDP_UADP};
+use super::insert::{self, DATA_SET_MESSAGE, NETWORK_MESSAGE};
 use super::{Kind, PubSub};
 use crate::layout::{Layout, TopicNode};
 
@@ -66,7 +66,7 @@ impl Content {
             name: insert::CONNECTION.into(),
             enabled: true,
             publisher_id: Variant::UInt16(u16::from(SpaceId::UA.get())),
-            transport_profile_uri: UDP_UADP.into(),
+            transport_profile_uri: insert::profile(mapping).into(),
             address: ExtensionObject::from_message(address),
             writer_groups: Some(writers.into_values().collect()),
             reader_groups: Some(readers.into_values().collect()),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use mappings::{GroupMode, KeySource, Mapping, SecurityGroup, SpaceId};
+use mappings::{GroupMode, KeySource, Mapping, MessageMapping, SecurityGroup, SpaceId};
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
     AttributeId, ConfigurationVersionDataType, DataSetMetaDataType, DataTypeId,
@@ -141,7 +141,8 @@ impl Insert<'_> {
             publisher,
             &object,
         );
-        tree.selection("TransportProfileUri", UDP_UADP, &object);
+        let profile = profile(self.mapping);
+        tree.selection("TransportProfileUri", profile, &object);
         properties(tree, "ConnectionProperties", &object);
         let address = tree.part("Address", ObjectTypeId::NetworkAddressUrlType, &object);
         let interface = pubsub.interface.as_deref().unwrap_or_default();
@@ -485,9 +486,22 @@ fn text(at: &At) -> String {
     }
 }
 
-/// Returns the URL of the group address.
+/// Returns the TransportProfileUri (OPC 10000-7).
+pub(super) fn profile(mapping: &Mapping) -> &'static str {
+    match &mapping.pubsub().broker {
+        None => UDP_UADP,
+        Some(broker) if broker.encoding == MessageMapping::Uadp => MQTT_UADP,
+        Some(_) => MQTT_JSON,
+    }
+}
+
+/// Returns the URL of the group or broker.
 pub(super) fn url(mapping: &Mapping) -> String {
-    format!("opc.udp://{}", mapping.pubsub().address)
+    let pubsub = mapping.pubsub();
+    match &pubsub.broker {
+        Some(broker) => broker.address.to_string(),
+        None => format!("opc.udp://{}", pubsub.address),
+    }
 }
 
 /// The BrowseName of the writers of a namespace.
@@ -507,7 +521,9 @@ pub(super) fn milliseconds(time: Duration) -> f64 {
 
 /// The BrowseName of the connection.
 pub(super) const CONNECTION: &str = "space";
-pub(super) const UDP_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-udp-uadp";
+const MQTT_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-mqtt-uadp";
+const MQTT_JSON: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-mqtt-json";
+const UDP_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-udp-uadp";
 const UINT16: (DataTypeId, i32) = (DataTypeId::UInt16, -1);
 const UINT32: (DataTypeId, i32) = (DataTypeId::UInt32, -1);
 const DURATION: (DataTypeId, i32) = (DataTypeId::Duration, -1);

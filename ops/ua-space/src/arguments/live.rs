@@ -15,9 +15,12 @@ pub(crate) struct Group {
     /// The network interface of the PubSub group, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     pub(crate) interface: Option<String>,
-    /// The PubSub group, as opc.udp://239.192.0.40:4840
+    /// The PubSub group, as opc.udp://239.192.0.40:4840, or an MQTT broker, as mqtt://broker.local:1883
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub(crate) address: Option<String>,
+    /// A mapping with the settings of an MQTT broker (`pubsub`): its address, TLS, log-in and prefix
+    #[arg(long, value_name = "MAPPING", env = "UA_BROKER")]
+    pub(crate) broker: Option<PathBuf>,
     /// The keys of a secured group, in the format of `ua-space keys` and `decode`: messages are
     /// decrypted with them, and requests are secured with the first
     #[arg(long, value_name = "FILE", env = "UA_KEYS")]

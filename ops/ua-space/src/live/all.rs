@@ -63,7 +63,7 @@ async fn heard(arguments: &List, group: &Group) -> Result<(InGroup, Live), Failu
 
 /// Returns the other groups that bridges announce, unless a group was given.
 fn elsewhere(arguments: &List, programs: &[Entry]) -> Vec<String> {
-    if arguments.group.address.is_some() {
+    if arguments.group.address.is_some() || arguments.group.broker.is_some() {
         return Vec::new();
     }
     let here = mappings::PubSub::ADDRESS.to_string();

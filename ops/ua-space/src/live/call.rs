@@ -17,7 +17,7 @@ use uadp::action::{
     ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, CallId, Heard,
     Outcome, Requestor, RequestorSettings,
 };
-use uadp::{Extras, NetworkHeader, OwnedPublisherId, StatusCode};
+use uadp::{Extras, OwnedPublisherId, StatusCode};
 
 use self::executor::Executor;
 use super::book::{Kind, News};
@@ -313,8 +313,8 @@ impl Asking<'_> {
         let now = self.live.now();
         while let Some(request) = self.requestor.poll_transmit(now) {
             let mut datagram = Vec::new();
-            let encoded =
-                request.encode(&mut datagram, &NetworkHeader::default(), &Extras::default());
+            let header = self.live.action_header();
+            let encoded = request.encode(&mut datagram, &header, &Extras::default());
             encoded
                 .and_then(uadp::action::ActionEncoder::finish)
                 .map_err(|error| Failure::Usage(format!("cannot be asked for: {error}")))?;

@@ -4,7 +4,7 @@ use serde_json::{Value, json};
 use uadp::BuiltinType;
 
 use super::described::{Field, list};
-use crate::shape::FieldValue;
+use crate::values::FieldValue;
 use crate::values::variant_bytes;
 
 /// A wrong argument, and the parameters that the call takes.

@@ -21,8 +21,8 @@ impl<P: Port> Shell<P> {
         self.port.add_awaited(&mut missing);
         // While the network is lost, the other spaces cannot be received, and its loss is reported
         // instead.
-        if self.udp.lost().is_none() {
-            let interface = self.udp.interface();
+        if self.carrier.lost().is_none() {
+            let interface = self.carrier.interface();
             add_spaces(&self.router, self.own, (&interface, now), &mut missing);
         }
         let PeerChanges { missing, arrived } = self.awaited.update(missing, now);

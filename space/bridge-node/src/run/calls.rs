@@ -8,6 +8,7 @@ use bytes::Bytes;
 use mappings::TopicId;
 use messages::ServiceType;
 use tracing::{debug, info, warn};
+use transport::Outgoing;
 
 use super::{Shell, not_sent};
 use crate::clock::now;
@@ -101,7 +102,11 @@ impl<P: Port> Shell<P> {
     }
 
     fn send_action(&mut self, topic: TopicId, bytes: Vec<u8>) {
-        if let Err(error) = self.send(&bytes) {
+        let message = Outgoing {
+            within: self.carrier.within(),
+            ..Outgoing::new(&bytes)
+        };
+        if let Err(error) = self.send(&message) {
             self.router
                 .not_called(topic, not_sent(error), &error.to_string());
         }

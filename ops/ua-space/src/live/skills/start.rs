@@ -46,6 +46,7 @@ fn same(group: &Group) -> Group {
     Group {
         interface: group.interface.clone(),
         address: group.address.clone(),
+        broker: group.broker.clone(),
         keys: group.keys.clone(),
         sign: group.sign,
     }

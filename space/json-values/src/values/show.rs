@@ -8,12 +8,15 @@ use uadp::{
     NodeId, QualifiedName, Scalar, StatusCode, Variant,
 };
 
-use crate::shape::{FieldValue, Status};
+use crate::field_value::{FieldValue, Status};
 use crate::structures::Structure;
 use crate::{iso_time, node_ids, status};
 
 /// Shows a Variant with its type.
-pub(crate) fn show_variant(variant: &Variant<'_>) -> Result<FieldValue, DecodeError> {
+///
+/// # Errors
+/// The value cannot be decoded or encoded.
+pub fn show_variant(variant: &Variant<'_>) -> Result<FieldValue, DecodeError> {
     let mut shown = FieldValue {
         ua_type: variant.builtin_type().map(uadp::BuiltinType::id),
         ..FieldValue::default()
@@ -35,7 +38,10 @@ pub(crate) fn show_variant(variant: &Variant<'_>) -> Result<FieldValue, DecodeEr
 }
 
 /// Shows a DataValue; a null Variant has the UaType 0.
-pub(crate) fn show_data_value(data_value: &DataValue<'_>) -> Result<FieldValue, DecodeError> {
+///
+/// # Errors
+/// The value cannot be decoded or encoded.
+pub fn show_data_value(data_value: &DataValue<'_>) -> Result<FieldValue, DecodeError> {
     let value = match &data_value.value {
         None => FieldValue::default(),
         Some(Variant::Null) => FieldValue {
@@ -55,7 +61,10 @@ pub(crate) fn show_data_value(data_value: &DataValue<'_>) -> Result<FieldValue, 
 }
 
 /// Shows a value without its type.
-pub(crate) fn show_scalar(scalar: Scalar<'_>) -> Result<Value, DecodeError> {
+///
+/// # Errors
+/// The value cannot be decoded or encoded.
+pub fn show_scalar(scalar: Scalar<'_>) -> Result<Value, DecodeError> {
     Ok(match scalar {
         Scalar::Boolean(value) => json!(value),
         Scalar::SByte(value) => json!(value),

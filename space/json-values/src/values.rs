@@ -1,4 +1,4 @@
-//! Converts values of the builtin types to JSON and back, following OPC 10000-6, 5.4.2.
+//! Conversion of values of the builtin types to JSON and back, following OPC 10000-6, 5.4.2.
 //!
 //! Information that this encoding would lose is kept: a null array has a key of its own, 64-bit
 //! integers are texts, DateTimes have seven digits. Lost are the payload of a NaN, and which of
@@ -7,8 +7,8 @@
 mod show;
 mod write;
 
-pub(crate) use show::{show_data_value, show_scalar, show_variant};
-pub(crate) use write::{data_value_bytes, variant_bytes, write_scalar};
+pub use show::{show_data_value, show_scalar, show_variant};
+pub use write::{data_value_bytes, variant_bytes, write_scalar};
 
 use std::fmt;
 
@@ -16,20 +16,23 @@ use serde_json::Value;
 
 /// A JSON value that cannot be encoded, with its path.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct WrongValue {
+pub struct WrongValue {
     path: String,
     what: String,
 }
 
 impl WrongValue {
-    pub(crate) fn new(what: impl Into<String>) -> Self {
+    /// Creates an error without a path.
+    pub fn new(what: impl Into<String>) -> Self {
         Self {
             path: String::new(),
             what: what.into(),
         }
     }
 
-    pub(crate) fn expected(what: &str, found: &Value) -> Self {
+    /// Creates an error for a value that is not `what`.
+    #[must_use]
+    pub fn expected(what: &str, found: &Value) -> Self {
         let mut found = found.to_string();
         if found.chars().count() > SHOWN {
             found = found.chars().take(SHOWN).collect();
@@ -39,7 +42,8 @@ impl WrongValue {
     }
 
     /// Prepends a part to the path of the value.
-    pub(crate) fn at(mut self, part: &str) -> Self {
+    #[must_use]
+    pub fn at(mut self, part: &str) -> Self {
         self.path.insert_str(0, part);
         self
     }

@@ -8,11 +8,11 @@ use crate::values::{WrongValue, show_scalar, write_scalar};
 
 /// The type of a structure and its fields, in order.
 #[derive(Debug)]
-pub(crate) struct Structure {
+pub struct Structure {
     /// NodeId of the type in namespace 0.
-    pub(crate) data_type: u32,
+    pub data_type: u32,
     /// NodeId of its binary encoding in namespace 0.
-    pub(crate) encoding: u32,
+    pub encoding: u32,
     fields: &'static [(&'static str, Part)],
 }
 
@@ -23,17 +23,22 @@ enum Part {
 }
 
 impl Structure {
-    pub(crate) fn by_encoding(encoding: u32) -> Option<&'static Self> {
+    /// Returns the structure with this NodeId of its binary encoding.
+    #[must_use]
+    pub fn by_encoding(encoding: u32) -> Option<&'static Self> {
         KNOWN.iter().find(|known| known.encoding == encoding)
     }
 
-    pub(crate) fn by_data_type(data_type: u32) -> Option<&'static Self> {
+    /// Returns the structure with this NodeId of its type.
+    #[must_use]
+    pub fn by_data_type(data_type: u32) -> Option<&'static Self> {
         KNOWN.iter().find(|known| known.data_type == data_type)
     }
 
     /// Returns the fields of a body; `None` if the body has other fields, or encoding the fields
     /// gives other bytes.
-    pub(crate) fn show(&self, body: &[u8]) -> Option<Map<String, Value>> {
+    #[must_use]
+    pub fn show(&self, body: &[u8]) -> Option<Map<String, Value>> {
         let mut reader = StructureReader::new(body);
         let mut shown = show_fields(self.fields, &mut reader)?;
         shown.insert(
@@ -46,11 +51,10 @@ impl Structure {
     }
 
     /// Appends the body.
-    pub(crate) fn write(
-        &self,
-        json: &Map<String, Value>,
-        out: &mut Vec<u8>,
-    ) -> Result<(), WrongValue> {
+    ///
+    /// # Errors
+    /// A [`WrongValue`] for a missing, unknown or wrong field.
+    pub fn write(&self, json: &Map<String, Value>, out: &mut Vec<u8>) -> Result<(), WrongValue> {
         write_fields(self.fields, &["UaTypeId"], json, out)
     }
 }

@@ -10,15 +10,18 @@ use uadp::{
 };
 
 use super::WrongValue;
+use crate::field_value::{FieldValue, Status};
 use crate::iso_time;
 use crate::node_ids::{OwnedNodeId, parse_guid};
-use crate::shape::{FieldValue, Status};
 use crate::structures::Structure;
 
 type Written = Result<(), WrongValue>;
 
 /// Returns the bytes of a Variant.
-pub(crate) fn variant_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
+///
+/// # Errors
+/// The value cannot be decoded or encoded.
+pub fn variant_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
     let quality = json.status.is_some()
         || json.source_timestamp.is_some()
         || json.source_picoseconds.is_some()
@@ -34,14 +37,20 @@ pub(crate) fn variant_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
 }
 
 /// Returns the bytes of a DataValue.
-pub(crate) fn data_value_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
+///
+/// # Errors
+/// The value cannot be decoded or encoded.
+pub fn data_value_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
     let mut out = Vec::new();
     write_data_value(json, &mut out)?;
     Ok(out)
 }
 
 /// Appends a value without its type.
-pub(crate) fn write_scalar(builtin: BuiltinType, json: &Value, out: &mut Vec<u8>) -> Written {
+///
+/// # Errors
+/// The value cannot be decoded or encoded.
+pub fn write_scalar(builtin: BuiltinType, json: &Value, out: &mut Vec<u8>) -> Written {
     match builtin {
         BuiltinType::Boolean => append(out, Scalar::Boolean(boolean(json)?)),
         BuiltinType::SByte => append(out, Scalar::SByte(integer(builtin, json)?)),

@@ -3,7 +3,8 @@
 use uadp::StatusCode;
 
 /// Returns the name of a code without info bits; `None` for codes that values rarely have.
-pub(crate) fn symbol(status: StatusCode) -> Option<&'static str> {
+#[must_use]
+pub fn symbol(status: StatusCode) -> Option<&'static str> {
     let known = |entry: &&(u32, &'static str)| entry.0 == status.0;
     KNOWN.iter().find(known).map(|(_, symbol)| *symbol)
 }

@@ -4,7 +4,8 @@ use uadp::DateTime;
 
 /// Formats a DateTime with as many digits as needed: `2026-05-17T12:34:56.789Z`. Years beyond four
 /// digits have a sign.
-pub(crate) fn of_date_time(time: DateTime) -> String {
+#[must_use]
+pub fn of_date_time(time: DateTime) -> String {
     let seconds = time.0.div_euclid(TICKS_PER_SECOND) - UNIX_EPOCH_SECONDS;
     let ticks = time.0.rem_euclid(TICKS_PER_SECOND);
     let fraction = format!("{ticks:07}");
@@ -14,7 +15,8 @@ pub(crate) fn of_date_time(time: DateTime) -> String {
 }
 
 /// Formats nanoseconds since 1970-01-01 UTC, with all nine digits.
-pub(crate) fn of_unix_nanos(nanos: i128) -> String {
+#[must_use]
+pub fn of_unix_nanos(nanos: i128) -> String {
     let seconds = i64::try_from(nanos.div_euclid(1_000_000_000)).unwrap_or_default();
     format!(
         "{}.{:09}Z",
@@ -24,7 +26,8 @@ pub(crate) fn of_unix_nanos(nanos: i128) -> String {
 }
 
 /// Parses a DateTime; `None` if the text is not a time or the time is out of range.
-pub(crate) fn parse(text: &str) -> Option<DateTime> {
+#[must_use]
+pub fn parse(text: &str) -> Option<DateTime> {
     let (date, time) = text.strip_suffix('Z')?.split_once('T')?;
     // The first sign belongs to the year.
     let (year, rest) = date.split_at_checked(date.get(1..)?.find('-')? + 1)?;

@@ -7,7 +7,7 @@ use uadp::{ExpandedNodeId, Guid, Identifier, NodeId};
 
 /// A NodeId that owns its text.
 #[derive(Debug, Default)]
-pub(crate) struct OwnedNodeId {
+pub struct OwnedNodeId {
     namespace: u16,
     identifier: OwnedIdentifier,
     namespace_uri: Option<String>,
@@ -48,7 +48,9 @@ impl OwnedIdentifier {
 
 impl OwnedNodeId {
     /// Parses a NodeId or ExpandedNodeId.
-    pub(crate) fn parse(text: &str) -> Option<Self> {
+    /// Parses the text of a NodeId or ExpandedNodeId.
+    #[must_use]
+    pub fn parse(text: &str) -> Option<Self> {
         let mut node_id = Self::default();
         let mut rest = text;
         if let Some((server, behind)) = part(rest, "svr=") {
@@ -68,12 +70,16 @@ impl OwnedNodeId {
     }
 
     /// Returns the NodeId; `None` with a URI or server index, which a NodeId does not have.
-    pub(crate) fn node_id(&self) -> Option<NodeId<'_>> {
+    /// Returns the NodeId, if its namespace is an index.
+    #[must_use]
+    pub fn node_id(&self) -> Option<NodeId<'_>> {
         let expanded = self.expanded();
         (expanded == expanded.node_id.into()).then_some(expanded.node_id)
     }
 
-    pub(crate) fn expanded(&self) -> ExpandedNodeId<'_> {
+    /// Returns the ExpandedNodeId.
+    #[must_use]
+    pub fn expanded(&self) -> ExpandedNodeId<'_> {
         let identifier = match &self.identifier {
             OwnedIdentifier::Numeric(identifier) => Identifier::Numeric(*identifier),
             OwnedIdentifier::String(identifier) => Identifier::String(identifier.as_deref()),
@@ -92,7 +98,8 @@ impl OwnedNodeId {
 }
 
 /// Formats a NodeId. A null identifier, for which the standard has no text, is `s` or `b` alone.
-pub(crate) fn text(node_id: NodeId<'_>) -> String {
+#[must_use]
+pub fn text(node_id: NodeId<'_>) -> String {
     let identifier = match node_id.identifier {
         Identifier::Numeric(identifier) => format!("i={identifier}"),
         Identifier::String(Some(identifier)) => format!("s={identifier}"),
@@ -108,7 +115,8 @@ pub(crate) fn text(node_id: NodeId<'_>) -> String {
 }
 
 /// Formats an ExpandedNodeId. A namespace index besides a URI is kept.
-pub(crate) fn expanded_text(node_id: ExpandedNodeId<'_>) -> String {
+#[must_use]
+pub fn expanded_text(node_id: ExpandedNodeId<'_>) -> String {
     let server = match node_id.server_index {
         0 => String::new(),
         index => format!("svr={index};"),
@@ -124,7 +132,8 @@ pub(crate) fn expanded_text(node_id: ExpandedNodeId<'_>) -> String {
 }
 
 /// Parses a Guid of the form `72962B91-FA75-4AE6-8D28-B404DC7DAF63`, in either case.
-pub(crate) fn parse_guid(text: &str) -> Option<Guid> {
+#[must_use]
+pub fn parse_guid(text: &str) -> Option<Guid> {
     let mut parts = text.split('-');
     let mut next = |digits: usize| {
         let part = parts.next().filter(|part| part.len() == digits)?;

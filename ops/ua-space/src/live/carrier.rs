@@ -1,0 +1,78 @@
+//! The group or broker that the commands inspect.
+
+use std::fs;
+use std::path::Path;
+
+use broker::{Identity, Mqtt};
+use mappings::{Broker, BrokerAddress, Mapping, PubSub};
+use transport::{Carrier, Options, Udp};
+
+use crate::arguments::Group;
+use crate::exit::Failure;
+
+/// Opens the group or broker of the command line. Returns its address for output too.
+pub(super) fn open(group: &Group) -> Result<(Box<dyn Carrier>, String), Failure> {
+    let settings = group.broker.as_deref().map(settings).transpose()?;
+    let broker = match &group.address {
+        Some(url) if BrokerAddress::is_mqtt(url) => {
+            let address = BrokerAddress::parse(url).ok_or_else(|| {
+                let example = BrokerAddress::EXAMPLE;
+                Failure::Usage(format!(
+                    "--address: not the address of a broker; for example {example}"
+                ))
+            })?;
+            let settings = settings.unwrap_or_else(|| Broker::new(address.clone()));
+            Some(Broker {
+                address,
+                ..settings
+            })
+        }
+        Some(_) => None,
+        None => settings,
+    };
+    if let Some(broker) = broker {
+        let identity = Identity {
+            program: "ua-space".to_owned(),
+            publisher: None,
+        };
+        let mqtt = Mqtt::open(&broker, &identity)
+            .map_err(|error| Failure::Usage(format!("MQTT: {error}")))?;
+        return Ok((Box::new(mqtt), broker.address.to_string()));
+    }
+    let address = match &group.address {
+        None => PubSub::ADDRESS,
+        Some(url) => PubSub::parse_address(url).ok_or_else(|| {
+            let (udp, mqtt) = (PubSub::ADDRESS, BrokerAddress::EXAMPLE);
+            Failure::Usage(format!(
+                "--address {url}: for example opc.udp://{udp}, or {mqtt} for a broker"
+            ))
+        })?,
+    };
+    let options = Options {
+        interface: group.interface.clone(),
+        ..Options::new(address)
+    };
+    let udp = Udp::open(&options).map_err(|error| Failure::Unavailable(error.to_string()))?;
+    Ok((Box::new(udp), address.to_string()))
+}
+
+/// Returns the broker of a mapping.
+fn settings(path: &Path) -> Result<Broker, Failure> {
+    let mapping = broker_mapping(path)?;
+    mapping.pubsub().broker.as_deref().cloned().ok_or_else(|| {
+        let (name, example) = (path.display(), BrokerAddress::EXAMPLE);
+        Failure::Usage(format!(
+            "--broker: {name} names no broker; for example pubsub: {{address: {example}}}"
+        ))
+    })
+}
+
+/// Reads a mapping for its broker. Faults in its other parts do not matter.
+pub(crate) fn broker_mapping(path: &Path) -> Result<Mapping, Failure> {
+    let name = path.display().to_string();
+    let text = fs::read_to_string(path)
+        .map_err(|error| Failure::Io(format!("cannot read {name}: {error}")))?;
+    let checked = Mapping::from_yaml(&text, &name);
+    let mapping = checked.outline().cloned();
+    mapping.ok_or_else(|| Failure::Data(format!("{name} cannot be read: `ua-space check {name}`")))
+}

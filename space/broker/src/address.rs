@@ -1,0 +1,239 @@
+//! The ids of a NetworkMessage, from which its topic follows.
+
+use mappings::TopicId;
+use uadp::action::{ActionDialect, ActionKind};
+use uadp::discovery::{Announced, Announcement, ConnectionState, CyclicStatus};
+use uadp::{NetworkMessage, NetworkMessageType, PublisherId};
+
+use crate::topics::{Address, MessageType};
+
+/// The evaluation of a NetworkMessage.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Addressed {
+    pub(crate) address: Address,
+    /// The topic that a discovery message withdraws.
+    pub(crate) withdrawn: Option<TopicId>,
+}
+
+/// Returns the ids of an own message; `None` if it cannot be carried.
+pub(crate) fn of(message: &NetworkMessage<'_>, own: Option<u16>) -> Option<Addressed> {
+    let publisher = publisher(message)?;
+    let group = message.group().and_then(|group| group.writer_group_id);
+    let mut writers = message.writer_ids().into_iter().flatten();
+    let writer = writers.next().filter(|_| writers.next().is_none());
+    let address = |kind| Address {
+        kind,
+        publisher,
+        group,
+        writer,
+    };
+    let addressed = |address| Addressed {
+        address,
+        withdrawn: None,
+    };
+    match message.message_type() {
+        NetworkMessageType::Probe => Some(addressed(alone(MessageType::Discovery, publisher))),
+        NetworkMessageType::Announcement => Some(announcement(message, publisher)),
+        NetworkMessageType::DataSet if is_action(message) => {
+            Some(addressed(address(action_kind(message, publisher, own))))
+        }
+        NetworkMessageType::DataSet => Some(addressed(address(MessageType::Data))),
+    }
+}
+
+/// Returns the PublisherId of a message if it is the number of a space.
+pub(crate) fn publisher(message: &NetworkMessage<'_>) -> Option<u16> {
+    match message.publisher_id()? {
+        PublisherId::Byte(id) => Some(id.into()),
+        PublisherId::UInt16(id) => Some(id),
+        PublisherId::UInt32(id) => id.try_into().ok(),
+        PublisherId::UInt64(id) => id.try_into().ok(),
+        PublisherId::String(_) => None,
+    }
+}
+
+/// Returns the status in a message.
+pub(crate) fn status(
+    message: &NetworkMessage<'_>,
+) -> Option<(ConnectionState, Option<CyclicStatus>)> {
+    if message.is_sealed() || message.is_chunk() {
+        return None;
+    }
+    match Announcement::decode(message).ok()?.announced {
+        Announced::ApplicationStatus { state, cyclic } => Some((state, cyclic)),
+        Announced::PublisherEndpoints { .. }
+        | Announced::DataSetMetaData { .. }
+        | Announced::DataSetWriterConfiguration { .. }
+        | Announced::PubSubConnections(_)
+        | Announced::PubSubConnection { .. }
+        | Announced::ApplicationDescription { .. }
+        | Announced::ActionResponder(_)
+        | Announced::ActionMetaData(_) => None,
+    }
+}
+
+const fn alone(kind: MessageType, publisher: u16) -> Address {
+    Address {
+        kind,
+        publisher,
+        group: None,
+        writer: None,
+    }
+}
+
+/// A chunk without DataSetWriterIds is of a request or response.
+fn is_action(message: &NetworkMessage<'_>) -> bool {
+    message.is_action() || (message.is_chunk() && message.writer_ids().is_none())
+}
+
+/// The PublisherId is that of the executor, in requests and in responses.
+fn action_kind(message: &NetworkMessage<'_>, publisher: u16, own: Option<u16>) -> MessageType {
+    let readable = message.is_action() && !message.is_sealed() && !message.is_chunk();
+    let actions = readable.then(|| message.actions(ActionDialect::Standard).ok());
+    let first = actions
+        .flatten()
+        .and_then(|mut actions| actions.next()?.ok());
+    match first.map(|first| first.action.kind) {
+        Some(ActionKind::Request) => MessageType::ActionRequest,
+        Some(ActionKind::Response) => MessageType::ActionResponse,
+        None if own == Some(publisher) => MessageType::ActionResponse,
+        None => MessageType::ActionRequest,
+    }
+}
+
+fn announcement(message: &NetworkMessage<'_>, publisher: u16) -> Addressed {
+    let hidden = Addressed {
+        address: alone(MessageType::Discovery, publisher),
+        withdrawn: None,
+    };
+    if message.is_sealed() || message.is_chunk() {
+        return hidden;
+    }
+    let Ok(announcement) = Announcement::decode(message) else {
+        return hidden;
+    };
+    let plain = |kind| Addressed {
+        address: alone(kind, publisher),
+        withdrawn: None,
+    };
+    let of_topic = |kind, name: Option<&str>| {
+        let (_, group, writer) = topic(name)?.triple();
+        Some(Addressed {
+            address: Address {
+                kind,
+                publisher,
+                group: Some(group),
+                writer: Some(writer),
+            },
+            withdrawn: None,
+        })
+    };
+    match announcement.announced {
+        Announced::DataSetMetaData {
+            meta_data, status, ..
+        } => match status.0 & BAD {
+            0 => of_topic(MessageType::MetaData, meta_data.name).unwrap_or(hidden),
+            _ => Addressed {
+                withdrawn: topic(meta_data.name),
+                ..hidden
+            },
+        },
+        Announced::ActionMetaData(action) => {
+            of_topic(MessageType::ActionMetaData, action.request.name).unwrap_or(hidden)
+        }
+        Announced::ApplicationDescription { .. } => plain(MessageType::Application),
+        Announced::PublisherEndpoints { .. } => plain(MessageType::Endpoints),
+        Announced::ApplicationStatus { .. } => plain(MessageType::Status),
+        Announced::PubSubConnections(_) | Announced::PubSubConnection { .. } => {
+            plain(MessageType::Connection)
+        }
+        Announced::ActionResponder(_) => plain(MessageType::ActionResponder),
+        Announced::DataSetWriterConfiguration { .. } => hidden,
+    }
+}
+
+/// Returns the topic that begins the name of a DataSet or Action, as in `ua_1_2_10 battery`.
+fn topic(name: Option<&str>) -> Option<TopicId> {
+    name?.split(' ').next()?.parse().ok()
+}
+
+/// The severity bit of a bad StatusCode.
+const BAD: u32 = 0x8000_0000;
+
+#[cfg(test)]
+mod tests {
+    use uadp::discovery::DataSetMetaDataType;
+    use uadp::{
+        DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, SecurityHeader,
+        StatusCode,
+    };
+
+    use super::*;
+
+    fn value(writers: &[u16]) -> Vec<u8> {
+        let network = NetworkHeader {
+            publisher_id: Some(PublisherId::UInt16(1)),
+            group: Some(GroupHeader {
+                writer_group_id: Some(2),
+                ..GroupHeader::default()
+            }),
+            ..NetworkHeader::default()
+        };
+        let mut bytes = Vec::new();
+        let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(writers)).unwrap();
+        for _ in writers {
+            message.keep_alive(&DataSetHeader::default()).unwrap();
+        }
+        message.finish().unwrap();
+        bytes
+    }
+
+    fn addressed(bytes: &[u8]) -> Addressed {
+        of(&NetworkMessage::decode(bytes).unwrap(), Some(1)).unwrap()
+    }
+
+    #[test]
+    fn a_value_has_the_topic_of_its_writer_and_several_have_that_of_their_group() {
+        let Address {
+            kind,
+            publisher,
+            group,
+            writer,
+        } = addressed(&value(&[10])).address;
+        assert_eq!(
+            (kind, publisher, group, writer),
+            (MessageType::Data, 1, Some(2), Some(10))
+        );
+        assert_eq!(addressed(&value(&[10, 11])).address.writer, None);
+    }
+
+    #[test]
+    fn metadata_has_the_topic_in_its_name_and_a_bad_status_withdraws_it() {
+        for (status, kind) in [
+            (StatusCode::GOOD, MessageType::MetaData),
+            (StatusCode(0x803E_0000), MessageType::Discovery),
+        ] {
+            let announcement = Announcement {
+                sequence_number: 1,
+                announced: Announced::DataSetMetaData {
+                    writer_id: 10,
+                    meta_data: DataSetMetaDataType {
+                        name: Some("ua_1_2_10 battery"),
+                        ..DataSetMetaDataType::default()
+                    },
+                    status,
+                },
+            };
+            let mut bytes = Vec::new();
+            let publisher = PublisherId::UInt16(1);
+            announcement
+                .encode(publisher, SecurityHeader::NONE, &mut bytes)
+                .unwrap();
+            let Addressed { address, withdrawn } = addressed(&bytes);
+            assert_eq!(address.kind, kind);
+            let is_withdrawn = kind == MessageType::Discovery;
+            assert_eq!(withdrawn.is_some(), is_withdrawn);
+            assert_eq!(address.writer.is_some(), !is_withdrawn);
+        }
+    }
+}

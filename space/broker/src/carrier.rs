@@ -1,0 +1,657 @@
+//! The carrier: topics of sent messages, and admission of received messages.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fmt;
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use mappings::{Broker, MqttVersion, TopicId};
+use tokio::sync::mpsc;
+use tokio::time::{Sleep, sleep};
+use transport::{Carrier, CarrierChange, Outgoing, Received, SendError, Senders};
+use uadp::discovery::ConnectionState;
+use uadp::{NetworkMessage, Timestamp};
+
+use crate::address::{self, Addressed};
+use crate::connection::{Link, Shared, State, instant, run};
+use crate::echo::Echo;
+use crate::json::Json;
+use crate::packets::Message;
+use crate::producers::Producers;
+use crate::queue::Publication;
+use crate::reports::Reports;
+use crate::settings::{Identity, OpenError, Settings};
+use crate::topics::{self, Address, JSON, MessageType, UADP};
+
+/// A connection with an MQTT broker that carries the NetworkMessages of a program.
+pub struct Mqtt {
+    settings: Arc<Settings>,
+    shared: Arc<Shared>,
+    received: mpsc::Receiver<(Message, SocketAddr)>,
+    /// Messages for the caller.
+    ready: VecDeque<(Vec<u8>, SocketAddr)>,
+    producers: Producers,
+    echo: Echo,
+    reports: Reports,
+    json: Json,
+    /// Numbers of dropped messages by reason.
+    dropped: BTreeMap<&'static str, u64>,
+    /// The last reported state of the connection; `None` before the first report.
+    connected: Option<bool>,
+    /// Polls the end of the connection.
+    closing: Option<std::pin::Pin<Box<Sleep>>>,
+}
+
+impl fmt::Debug for Mqtt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let broker = self.settings.broker.address.to_string();
+        f.debug_struct("Mqtt")
+            .field("broker", &broker)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Mqtt {
+    /// Starts to connect with the broker. A broker that is not there is waited for.
+    ///
+    /// Must be called within a tokio runtime.
+    ///
+    /// # Errors
+    /// An [`OpenError`] if a file with certificates or the log-in cannot be used.
+    pub fn open(broker: &Broker, identity: &Identity) -> Result<Self, OpenError> {
+        let settings = Arc::new(Settings::read(broker, identity)?);
+        let shared = Arc::new(Shared::default());
+        let (out, received) = mpsc::channel(MAX_RECEIVED);
+        // The task ends when the carrier is closed or dropped.
+        drop(tokio::spawn(run(
+            Arc::clone(&settings),
+            Arc::clone(&shared),
+            out,
+        )));
+        Ok(Self {
+            settings,
+            shared,
+            received,
+            ready: VecDeque::new(),
+            producers: Producers::default(),
+            echo: Echo::default(),
+            reports: Reports::default(),
+            json: Json::new(broker.encoding),
+            dropped: BTreeMap::new(),
+            connected: None,
+            closing: None,
+        })
+    }
+
+    fn broker(&self) -> &Broker {
+        &self.settings.broker
+    }
+
+    /// Returns whether values are sent as JSON.
+    fn writes_json(&self) -> bool {
+        topics::encoding(self.broker().encoding) == JSON
+    }
+
+    fn publication(&self, encoding: &str, address: Address, payload: Vec<u8>) -> Publication {
+        let retained = address.kind.is_retained();
+        let broker = self.broker();
+        let is_value = address.kind == MessageType::Data;
+        Publication {
+            topic: topics::name(broker, encoding, address),
+            payload,
+            retained,
+            confirmed: retained || (is_value && broker.at_least_once),
+            replaceable: retained,
+            within: retained.then_some(RETAINED),
+            message_type: message_type(address.kind),
+            content_type: if encoding == JSON {
+                CONTENT_JSON
+            } else {
+                CONTENT_UADP
+            },
+        }
+    }
+
+    /// Publishes a retained message now and with each connection.
+    fn keep(&self, publication: Publication) {
+        let mut state = self.shared.state();
+        let State {
+            queue, kept, link, ..
+        } = &mut *state;
+        if matches!(link, Link::Connected { .. }) {
+            // The message is published again later if the queue is full.
+            let _full = queue.push(publication.clone(), instant()).is_err();
+        }
+        if kept.len() < MAX_KEPT || kept.contains_key(&publication.topic) {
+            kept.insert(publication.topic.clone(), publication);
+        }
+        drop(state);
+        self.shared.wake();
+    }
+
+    /// Clears a retained message.
+    fn clear(&self, topic: String) {
+        let mut state = self.shared.state();
+        state.kept.remove(&topic);
+        let cleared = Publication {
+            topic,
+            payload: Vec::new(),
+            retained: true,
+            confirmed: true,
+            replaceable: true,
+            within: None,
+            message_type: "",
+            content_type: "",
+        };
+        if matches!(state.link, Link::Connected { .. }) {
+            // With MQTT 5 the message expires if it cannot be cleared.
+            let _full = state.queue.push(cleared, instant()).is_err();
+        }
+        drop(state);
+        self.shared.wake();
+    }
+
+    /// Clears the discovery messages of a topic.
+    fn withdraw(&self, topic: TopicId) {
+        let (publisher, group, writer) = topic.triple();
+        for kind in [MessageType::MetaData, MessageType::ActionMetaData] {
+            let address = Address {
+                kind,
+                publisher,
+                group: Some(group),
+                writer: Some(writer),
+            };
+            for encoding in [UADP, JSON] {
+                let name = topics::name(self.broker(), encoding, address);
+                let is_kept = self.shared.state().kept.contains_key(&name);
+                if is_kept {
+                    self.clear(name);
+                }
+            }
+        }
+    }
+
+    fn count(&mut self, reason: &'static str) {
+        *self.dropped.entry(reason).or_default() += 1;
+    }
+
+    /// Handles a received message, and queues the messages for the caller.
+    fn admit(&mut self, message: Message, from: SocketAddr) {
+        match self.judge(&message, from) {
+            Ok(true) => self.ready.push_back((message.payload, from)),
+            Ok(false) => {}
+            Err(reason) => self.count(reason),
+        }
+    }
+
+    /// Returns whether a message is for the caller, or the reason why it is dropped.
+    fn judge(&mut self, message: &Message, from: SocketAddr) -> Result<bool, &'static str> {
+        let Message {
+            topic,
+            payload,
+            retained,
+        } = message;
+        let read = topics::parse(self.broker(), topic).ok_or("other_topic")?;
+        let Address {
+            kind, publisher, ..
+        } = read.address;
+        if self.echo.is_own(topic, payload) {
+            return Err("own");
+        }
+        if payload.is_empty() {
+            // A retained message was cleared.
+            return Ok(false);
+        }
+        // Names of the space have no level for the encoding.
+        if read.is_json || payload.starts_with(b"{") || payload.starts_with(b"[") {
+            return self.judge_json(message, read.address, from);
+        }
+        // The caller counts malformed messages.
+        let Ok(network) = NetworkMessage::decode(payload) else {
+            return Ok(true);
+        };
+        // The access rules of a broker refer to topics.
+        if address::publisher(&network) != Some(publisher) || !agrees(&network, read.address) {
+            return Err("other_publisher");
+        }
+        let now = instant();
+        if kind == MessageType::Connection {
+            if *retained && self.settings.publisher == Some(publisher) {
+                self.reports.stray(topic, now);
+            }
+            return Ok(false);
+        }
+        if kind == MessageType::Status {
+            let status = address::status(&network).ok_or("malformed_status")?;
+            let is_own = self.settings.publisher == Some(publisher);
+            if is_own && status.0 != ConnectionState::OPERATIONAL {
+                // Another program of the space has ended.
+                self.reports.hurry();
+            }
+            let released = self.producers.status(publisher, status, (now, utc()));
+            self.release(released, from);
+            return Ok(false);
+        }
+        if !retained {
+            let released = self.producers.lives(publisher);
+            self.release(released, from);
+            if kind == MessageType::MetaData {
+                self.json.learn(&network);
+            }
+            return Ok(true);
+        }
+        self.judge_retained(message, (&network, read.address))
+    }
+
+    /// Judges a retained message, which may be old.
+    fn judge_retained(
+        &mut self,
+        message: &Message,
+        (network, address): (&NetworkMessage<'_>, Address),
+    ) -> Result<bool, &'static str> {
+        let Address {
+            kind, publisher, ..
+        } = address;
+        let Message { topic, payload, .. } = message;
+        let now = instant();
+        if !kind.is_retained() {
+            // A value that another stack retains. It counts only while its publisher runs, and its
+            // age decides later.
+            let is_state = kind == MessageType::Data;
+            let runs = self.producers.is_operational(publisher, now);
+            return if is_state && runs {
+                Ok(true)
+            } else {
+                Err("retained")
+            };
+        }
+        if self.settings.publisher == Some(publisher) {
+            self.reports.stray(topic, now);
+            return Ok(false);
+        }
+        if self.producers.is_operational(publisher, now) {
+            if kind == MessageType::MetaData {
+                self.json.learn(network);
+            }
+            return Ok(true);
+        }
+        match self.producers.hold(publisher, topic, payload) {
+            true => Ok(false),
+            false => Err("no_room"),
+        }
+    }
+
+    /// Judges a message of the JSON mapping, and queues its values as UADP.
+    fn judge_json(
+        &mut self,
+        message: &Message,
+        address: Address,
+        from: SocketAddr,
+    ) -> Result<bool, &'static str> {
+        let Message {
+            topic,
+            payload,
+            retained,
+        } = message;
+        let now = instant();
+        let Address {
+            kind, publisher, ..
+        } = address;
+        let is_own = self.settings.publisher == Some(publisher);
+        if *retained && kind != MessageType::Status {
+            let runs = self.producers.is_operational(publisher, now);
+            match kind.is_retained() {
+                true if is_own => {
+                    self.reports.stray(topic, now);
+                    return Ok(false);
+                }
+                true if !runs => {
+                    return match self.producers.hold(publisher, topic, payload) {
+                        true => Ok(false),
+                        false => Err("no_room"),
+                    };
+                }
+                false if !runs => return Err("retained"),
+                true | false => {}
+            }
+        }
+        let reading = self.json.read(payload, address)?;
+        for fault in reading.faults {
+            self.count(fault);
+        }
+        if let Some(status) = reading.status {
+            let released = self.producers.status(publisher, status, (now, utc()));
+            self.release(released, from);
+        } else if !retained {
+            let released = self.producers.lives(publisher);
+            self.release(released, from);
+        }
+        let values = reading.messages.into_iter().map(|bytes| (bytes, from));
+        self.ready.extend(values);
+        Ok(false)
+    }
+
+    /// Handles retained messages whose publisher is Operational.
+    fn release(&mut self, released: BTreeMap<String, Vec<u8>>, from: SocketAddr) {
+        for (topic, payload) in released {
+            let message = Message {
+                topic,
+                payload,
+                retained: false,
+            };
+            self.admit(message, from);
+        }
+    }
+
+    /// Publishes a message that the broker keeps, as UADP, and as JSON if the mapping wants JSON.
+    fn announce(&mut self, network: &NetworkMessage<'_>, address: Address) {
+        let uadp = self.publication(UADP, address, network.datagram().to_vec());
+        self.keep(uadp);
+        if !self.writes_json() {
+            return;
+        }
+        let json = match (address.kind, address::status(network)) {
+            (MessageType::Status, Some(status)) => {
+                Some(self.json.status(address.publisher, status, utc()))
+            }
+            (MessageType::MetaData, _) => self.json.describe(network, utc()),
+            _ => None,
+        };
+        if let Some(json) = json {
+            let publication = self.publication(JSON, address, json);
+            self.keep(publication);
+        }
+    }
+
+    /// Publishes the own status.
+    fn announce_status(&mut self, publisher: u16, status: &[u8]) {
+        if let Ok(network) = NetworkMessage::decode(status) {
+            self.announce(&network, alone(MessageType::Status, publisher));
+        }
+    }
+
+    /// Publishes the status if it is due, and clears the discovery messages of earlier runs.
+    fn report(&mut self) {
+        let Some(publisher) = self.settings.publisher else {
+            return;
+        };
+        let now = instant();
+        if let Some(status) = self.reports.status(publisher, (now, utc())) {
+            self.announce_status(publisher, &status);
+        }
+        if publisher != 0
+            && let Some(connection) = self.reports.connection(publisher, now)
+        {
+            let address = alone(MessageType::Connection, publisher);
+            let publication = self.publication(UADP, address, connection);
+            self.keep(publication);
+        }
+        // Several programs share space 0, so the discovery messages of others are not strays. With
+        // MQTT 5 they expire.
+        if publisher == 0 {
+            return;
+        }
+        for topic in self.reports.take_strays(now) {
+            if !self.shared.state().kept.contains_key(&topic) {
+                self.clear(topic);
+            }
+        }
+    }
+
+    fn take(&mut self, buffer: &mut Vec<u8>) -> Option<Received> {
+        let (bytes, from) = self.ready.pop_front()?;
+        if buffer.len() < bytes.len() {
+            buffer.resize(bytes.len(), 0);
+        }
+        let start = buffer.get_mut(..bytes.len())?;
+        start.copy_from_slice(&bytes);
+        Some(Received {
+            length: bytes.len(),
+            from,
+        })
+    }
+}
+
+impl Carrier for Mqtt {
+    fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError> {
+        let network = NetworkMessage::decode(message.bytes).map_err(|_| SendError::Refused)?;
+        let Addressed { address, withdrawn } =
+            address::of(&network, self.settings.publisher).ok_or(SendError::Refused)?;
+        if let Some(topic) = withdrawn {
+            self.withdraw(topic);
+        }
+        if address.kind.is_retained() {
+            self.announce(&network, address);
+            return Ok(());
+        }
+        if address.kind == MessageType::Data {
+            self.reports.uses(address, instant());
+        }
+        let is_json = address.kind == MessageType::Data && !message.command && self.writes_json();
+        let json = is_json.then(|| self.json.value(&network, utc())).flatten();
+        let mut publication = match json {
+            Some(json) => self.publication(JSON, address, json),
+            None => self.publication(UADP, address, message.bytes.to_vec()),
+        };
+        publication.replaceable = message.replaceable && !network.is_chunk();
+        publication.within = message.within;
+        // Commands are never queued for an absent reader.
+        publication.confirmed &= message.replaceable;
+        let mut state = self.shared.state();
+        let Link::Connected {
+            version,
+            max_packet,
+            ..
+        } = state.link
+        else {
+            return Err(SendError::Unreachable);
+        };
+        let size = publication.payload.len() + publication.topic.len() + OVERHEAD;
+        if max_packet.is_some_and(|most| u32::try_from(size).is_ok_and(|size| size > most)) {
+            return Err(SendError::TooBig);
+        }
+        if version == MqttVersion::V3_1_1 {
+            self.echo.sent(&publication.topic, &publication.payload);
+        }
+        state.queue.push(publication, instant())?;
+        drop(state);
+        self.shared.wake();
+        Ok(())
+    }
+
+    fn poll_recv(
+        &mut self,
+        cx: &mut Context<'_>,
+        buffer: &mut Vec<u8>,
+    ) -> Poll<io::Result<Received>> {
+        loop {
+            if let Some(received) = self.take(buffer) {
+                return Poll::Ready(Ok(received));
+            }
+            match self.received.poll_recv(cx) {
+                Poll::Ready(Some((message, from))) => self.admit(message, from),
+                // The connection is closed: nothing more comes.
+                Poll::Ready(None) | Poll::Pending => return Poll::Pending,
+            }
+        }
+    }
+
+    fn try_recv(&mut self, buffer: &mut Vec<u8>) -> Option<io::Result<Received>> {
+        loop {
+            if let Some(received) = self.take(buffer) {
+                return Some(Ok(received));
+            }
+            let (message, from) = self.received.try_recv().ok()?;
+            self.admit(message, from);
+        }
+    }
+
+    fn follow(&mut self) -> Option<CarrierChange> {
+        self.report();
+        let is_connected = self.lost().is_none();
+        if self.connected.replace(is_connected) == Some(is_connected) {
+            return None;
+        }
+        Some(match self.lost() {
+            Some(why) => CarrierChange::Lost(why),
+            None => CarrierChange::Back(self.interface()),
+        })
+    }
+
+    fn lost(&self) -> Option<String> {
+        match &self.shared.state().link {
+            Link::Connected { .. } => None,
+            Link::Waiting(why) => Some(format!("waiting for broker {}: {why}", self.interface())),
+        }
+    }
+
+    fn source(&self) -> Option<SocketAddr> {
+        None
+    }
+
+    fn interface(&self) -> String {
+        self.broker().address.to_string()
+    }
+
+    fn senders(&self) -> Senders {
+        match self.broker().acl {
+            true => Senders::Authorized,
+            false => Senders::Hidden,
+        }
+    }
+
+    fn within(&self) -> Option<Duration> {
+        Some(self.broker().within)
+    }
+
+    fn limit(&self) -> Option<usize> {
+        match self.shared.state().link {
+            Link::Connected { max_packet, .. } => {
+                let most = usize::try_from(max_packet?).unwrap_or(usize::MAX);
+                Some(most.saturating_sub(self.broker().prefix.len() + OVERHEAD + LONGEST_TOPIC))
+            }
+            Link::Waiting(_) => None,
+        }
+    }
+
+    fn dropped(&self) -> Vec<(&'static str, u64)> {
+        let state = self.shared.state();
+        let queue = [
+            ("queue_expired", state.queue.expired),
+            ("queue_replaced", state.queue.replaced),
+            ("connection_lost", state.queue.discarded),
+        ];
+        let received = self.dropped.iter().map(|(reason, count)| (*reason, *count));
+        queue.into_iter().chain(received).collect()
+    }
+
+    fn close(&mut self) {
+        let kept: Vec<String> = self.shared.state().kept.keys().cloned().collect();
+        let status = self
+            .settings
+            .publisher
+            .map(|of| alone(MessageType::Status, of));
+        let stays: Vec<String> = [UADP, JSON]
+            .into_iter()
+            .filter_map(|encoding| Some(topics::name(self.broker(), encoding, status?)))
+            .collect();
+        for topic in kept {
+            if !stays.contains(&topic) {
+                self.clear(topic);
+            }
+        }
+        if let Some(publisher) = self.settings.publisher
+            && let Some(last) = self.reports.last_status(publisher)
+        {
+            self.announce_status(publisher, &last);
+        }
+        self.shared.close();
+    }
+
+    fn poll_closed(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+        loop {
+            if self.shared.is_closed() {
+                return Poll::Ready(());
+            }
+            let wait = self
+                .closing
+                .get_or_insert_with(|| Box::pin(sleep(CLOSED_POLL)));
+            if wait.as_mut().poll(cx).is_pending() {
+                return Poll::Pending;
+            }
+            self.closing = None;
+        }
+    }
+}
+
+impl Drop for Mqtt {
+    fn drop(&mut self) {
+        self.shared.close();
+    }
+}
+
+/// Returns whether the group and writer of a message are those of its topic, as far as the topic
+/// names them.
+fn agrees(network: &NetworkMessage<'_>, address: Address) -> bool {
+    if address.kind != MessageType::Data {
+        return true;
+    }
+    let group = network.group().and_then(|group| group.writer_group_id);
+    let is_group = address.group.is_none_or(|wanted| group == Some(wanted));
+    let is_writer = address.writer.is_none_or(|wanted| {
+        let writers = network.writer_ids();
+        writers.is_none_or(|mut writers| writers.all(|id| id == wanted))
+    });
+    is_group && is_writer
+}
+
+const fn alone(kind: MessageType, publisher: u16) -> Address {
+    Address {
+        kind,
+        publisher,
+        group: None,
+        writer: None,
+    }
+}
+
+/// Returns the value of the user property `UAMessageType`.
+const fn message_type(kind: MessageType) -> &'static str {
+    match kind {
+        MessageType::Data => "ua-data",
+        MessageType::MetaData => "ua-metadata",
+        MessageType::Status => "ua-status",
+        MessageType::Connection => "ua-connection",
+        MessageType::Application => "ua-application",
+        MessageType::Endpoints => "ua-endpoints",
+        MessageType::ActionRequest => "ua-action-request",
+        MessageType::ActionResponse => "ua-action-response",
+        MessageType::ActionMetaData => "ua-action-metadata",
+        MessageType::ActionResponder => "ua-action-responder",
+        MessageType::Discovery => "ua-discovery",
+    }
+}
+
+#[expect(
+    clippy::disallowed_methods,
+    reason = "the time of reports at the broker"
+)]
+fn utc() -> Timestamp {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH);
+    let nanos = i128::try_from(since.unwrap_or_default().as_nanos()).unwrap_or_default();
+    Timestamp::from_unix_nanos(nanos)
+}
+
+const CONTENT_UADP: &str = "application/opcua+uadp";
+const CONTENT_JSON: &str = "application/json";
+/// The lifetime of a retained message with MQTT 5. Programs announce it again much earlier.
+const RETAINED: Duration = Duration::from_secs(300);
+/// Size in bytes of the headers and properties of a packet.
+const OVERHEAD: usize = 160;
+const LONGEST_TOPIC: usize = 64;
+/// The most messages that wait for the caller. When they wait, the broker waits.
+const MAX_RECEIVED: usize = 4096;
+const MAX_KEPT: usize = 65_536;
+const CLOSED_POLL: Duration = Duration::from_millis(10);

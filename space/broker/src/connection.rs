@@ -1,0 +1,508 @@
+//! The connection with the broker: a task that reconnects.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use mappings::MqttVersion;
+use mqtt_protocol_core::mqtt;
+use mqtt_protocol_core::mqtt::common::Cursor;
+use mqtt_protocol_core::mqtt::connection::{ConnectionOptions, GenericEvent, TimerKind};
+use mqtt_protocol_core::mqtt::packet::{GenericPacketTrait as _, Packet};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::sync::{Notify, mpsc};
+use tokio::time::{Instant as TokioInstant, sleep, sleep_until, timeout};
+use tracing::{debug, info, warn};
+
+use crate::packets::{self, Accepted, Event, Message};
+use crate::queue::{Publication, Queue};
+use crate::settings::{Settings, random};
+use crate::stream::{Stream, connect};
+use crate::topics;
+
+/// The state that the task shares with the carrier.
+#[derive(Debug, Default)]
+pub(crate) struct Shared {
+    state: Mutex<State>,
+    /// Wakes the task, because the queue has messages or the connection is to be closed.
+    wake: Notify,
+}
+
+#[derive(Debug, Default)]
+pub(crate) struct State {
+    pub(crate) queue: Queue,
+    pub(crate) link: Link,
+    /// Number of connections so far.
+    pub(crate) connections: u64,
+    /// The retained messages by topic. They are published again with each connection, because a
+    /// broker may lose them.
+    pub(crate) kept: BTreeMap<String, Publication>,
+    closing: bool,
+    closed: bool,
+}
+
+/// The state of the connection.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Link {
+    /// There is no connection, for this reason.
+    Waiting(String),
+    /// The broker accepted the connection.
+    Connected {
+        at: SocketAddr,
+        version: MqttVersion,
+        /// The largest packet that the broker takes.
+        max_packet: Option<u32>,
+    },
+}
+
+impl Default for Link {
+    fn default() -> Self {
+        Self::Waiting("no connection was attempted yet".to_owned())
+    }
+}
+
+impl Shared {
+    /// Returns the state. It stays consistent if a holder of the lock panics.
+    pub(crate) fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Wakes the task for queued messages.
+    pub(crate) fn wake(&self) {
+        self.wake.notify_one();
+    }
+
+    /// Closes the connection after the queued messages.
+    pub(crate) fn close(&self) {
+        self.state().closing = true;
+        self.wake.notify_one();
+    }
+
+    /// Records that there is no connection. Returns false if the connection is to be closed.
+    fn waits(&self, why: &str) -> bool {
+        let mut state = self.state();
+        state.queue.discard();
+        state.link = Link::Waiting(why.to_owned());
+        !state.closing
+    }
+
+    /// Records that the connection is closed.
+    fn closed(&self) {
+        let mut state = self.state();
+        state.link = Link::Waiting("closed".to_owned());
+        state.closed = true;
+    }
+
+    pub(crate) fn is_closed(&self) -> bool {
+        self.state().closed
+    }
+}
+
+/// The reason why a connection ended.
+enum Ended {
+    Closed,
+    Lost(String),
+}
+
+/// Runs the connection until it is closed.
+pub(crate) async fn run(
+    settings: Arc<Settings>,
+    shared: Arc<Shared>,
+    received: mpsc::Sender<(Message, SocketAddr)>,
+) {
+    let mut pause = FIRST_PAUSE;
+    let mut version = settings.broker.version.unwrap_or(MqttVersion::V5);
+    loop {
+        let before = shared.state().connections;
+        let mut session = Session::new(&settings, &shared, version);
+        let ended = session.run(&received).await;
+        if session.refuses_version && settings.broker.version.is_none() {
+            version = match version {
+                MqttVersion::V5 => MqttVersion::V3_1_1,
+                MqttVersion::V3_1_1 => MqttVersion::V5,
+            };
+        }
+        if shared.state().connections > before {
+            pause = FIRST_PAUSE;
+        }
+        match ended {
+            Ended::Lost(why) if !received.is_closed() && shared.waits(&why) => {
+                debug!(broker = %settings.broker.address, "no connection: {why}");
+            }
+            Ended::Lost(_) | Ended::Closed => return shared.closed(),
+        }
+        // Programs that lost the same broker return at different times.
+        let jitter = Duration::from_millis(random() % 100);
+        tokio::select! {
+            () = sleep(pause + jitter) => {}
+            () = shared.wake.notified() => {}
+        }
+        pause = (pause * 2).min(LAST_PAUSE);
+    }
+}
+
+/// One connection.
+struct Session<'a> {
+    settings: &'a Settings,
+    shared: &'a Shared,
+    version: MqttVersion,
+    protocol: mqtt::Connection<mqtt::role::Client>,
+    /// Bytes to write, and the number of them that are written.
+    out: (Vec<u8>, usize),
+    timers: BTreeMap<u8, (TimerKind, TokioInstant)>,
+    /// The time of the next ping.
+    next_ping: TokioInstant,
+    /// The time of the first ping after which nothing was received.
+    unanswered: Option<TokioInstant>,
+    /// Packet identifiers of publications that the broker has not confirmed.
+    unconfirmed: BTreeSet<u16>,
+    at: SocketAddr,
+    refuses_version: bool,
+    over: Option<String>,
+    messages: Vec<Message>,
+}
+
+impl<'a> Session<'a> {
+    fn new(settings: &'a Settings, shared: &'a Shared, version: MqttVersion) -> Self {
+        let protocol_version = match version {
+            MqttVersion::V3_1_1 => mqtt::Version::V3_1_1,
+            MqttVersion::V5 => mqtt::Version::V5_0,
+        };
+        let options = ConnectionOptions::new().maximum_packet_size_recv(packets::MAX_RECEIVED);
+        let mut protocol = mqtt::Connection::with_options(protocol_version, options);
+        protocol.set_auto_pub_response(true);
+        // The library pings only if nothing else is sent, so a broker that does not read would not
+        // be noticed.
+        let _no_events = protocol.set_pingreq_send_interval(Some(0));
+        Self {
+            settings,
+            shared,
+            version,
+            protocol,
+            out: (Vec::new(), 0),
+            timers: BTreeMap::new(),
+            next_ping: TokioInstant::now() + PING,
+            unanswered: None,
+            unconfirmed: BTreeSet::new(),
+            at: SocketAddr::from(([0, 0, 0, 0], 0)),
+            refuses_version: false,
+            over: None,
+            messages: Vec::new(),
+        }
+    }
+
+    async fn run(&mut self, received: &mpsc::Sender<(Message, SocketAddr)>) -> Ended {
+        let connected = tokio::select! {
+            connected = connect(self.settings) => connected,
+            () = self.closing() => return Ended::Closed,
+        };
+        let mut stream = match connected {
+            Ok((stream, at)) => {
+                self.at = at;
+                stream
+            }
+            Err(error) => return Ended::Lost(error.to_string()),
+        };
+        match packets::connect(self.settings, self.version) {
+            Ok(packet) => self.send(packet),
+            Err(error) => return Ended::Lost(format!("cannot connect: {error:?}")),
+        }
+        let accepted = TokioInstant::now() + ACCEPT;
+        let ended = self.exchange(&mut stream, received, accepted).await;
+        if let Ended::Closed = ended {
+            self.finish(&mut stream).await;
+        }
+        ended
+    }
+
+    /// Completes when the carrier is to be closed.
+    async fn closing(&self) {
+        loop {
+            if self.shared.state().closing {
+                return;
+            }
+            self.shared.wake.notified().await;
+        }
+    }
+
+    /// Exchanges packets until the connection ends.
+    async fn exchange(
+        &mut self,
+        stream: &mut Box<dyn Stream>,
+        received: &mpsc::Sender<(Message, SocketAddr)>,
+        accepted: TokioInstant,
+    ) -> Ended {
+        let (mut reader, mut writer) = tokio::io::split(stream);
+        let mut buffer = vec![0; READ];
+        loop {
+            if let Some(why) = self.over.take() {
+                return Ended::Lost(why);
+            }
+            for message in std::mem::take(&mut self.messages) {
+                if received.send((message, self.at)).await.is_err() {
+                    return Ended::Closed;
+                }
+            }
+            if self.fill() {
+                return Ended::Closed;
+            }
+            let connected = self.is_connected();
+            let timer = self.next_timer((!connected).then_some(accepted));
+            let pending = self.out.0.len() > self.out.1;
+            tokio::select! {
+                read = reader.read(&mut buffer) => match read {
+                    Ok(0) => {
+                        self.refuses_version = !connected;
+                        return Ended::Lost("the broker closed the connection".to_owned());
+                    }
+                    Ok(length) => self.receive(buffer.get(..length).unwrap_or_default()),
+                    Err(error) => return Ended::Lost(lost(&error)),
+                },
+                written = writer.write(self.out.0.get(self.out.1..).unwrap_or_default()), if pending => {
+                    match written {
+                        Ok(0) => return Ended::Lost("the broker closed the connection".to_owned()),
+                        Ok(length) => self.written(length),
+                        Err(error) => return Ended::Lost(lost(&error)),
+                    }
+                }
+                () = sleep_until(timer) => {
+                    if !connected && TokioInstant::now() >= accepted {
+                        return Ended::Lost("the broker does not answer".to_owned());
+                    }
+                    self.fire();
+                }
+                () = self.shared.wake.notified(), if !pending => {}
+            }
+        }
+    }
+
+    /// Returns the time of the next timeout. `accepted` is set until the broker has accepted the
+    /// connection.
+    fn next_timer(&self, accepted: Option<TokioInstant>) -> TokioInstant {
+        let timers = self.timers.values().map(|(_, at)| *at);
+        let stalled = self.unanswered.map(|since| since + STALL);
+        let ping = accepted.is_none().then_some(self.next_ping);
+        let all = timers.chain(stalled).chain(accepted).chain(ping);
+        all.min().unwrap_or(self.next_ping)
+    }
+
+    fn is_connected(&self) -> bool {
+        matches!(self.shared.state().link, Link::Connected { .. })
+    }
+
+    fn written(&mut self, length: usize) {
+        self.out.1 += length;
+        if self.out.1 >= self.out.0.len() {
+            self.out.0.clear();
+            self.out.1 = 0;
+        }
+    }
+
+    /// Fills the write buffer with waiting messages, if it is empty: a message is taken as late as
+    /// possible, so that it expires in the queue. Returns whether the connection is to be closed.
+    fn fill(&mut self) -> bool {
+        if !self.out.0.is_empty() || !self.is_connected() {
+            return self.out.0.is_empty() && self.shared.state().closing;
+        }
+        while self.out.0.len() < WRITE {
+            let now = TokioInstant::now().into_std();
+            let mut state = self.shared.state();
+            let Some(waiting) = state.queue.pop(now) else {
+                return state.closing && self.out.0.is_empty();
+            };
+            if waiting.0.confirmed && self.unconfirmed.len() >= MAX_UNCONFIRMED {
+                state.queue.unpop(waiting);
+                return false;
+            }
+            drop(state);
+            self.publish(waiting.0);
+        }
+        false
+    }
+
+    fn publish(&mut self, publication: Publication) {
+        let id = match publication.confirmed {
+            true => match self.protocol.acquire_packet_id() {
+                Ok(id) => {
+                    self.unconfirmed.insert(id);
+                    Some(id)
+                }
+                Err(_all_used) => None,
+            },
+            false => None,
+        };
+        match packets::publish(publication, (self.version, id)) {
+            Ok(packet) => self.send(packet),
+            Err(error) => warn!(?error, "cannot publish a message at the broker"),
+        }
+    }
+
+    fn send(&mut self, packet: Packet) {
+        let events = self.protocol.send(packet);
+        self.handle(events);
+    }
+
+    fn receive(&mut self, bytes: &[u8]) {
+        self.unanswered = None;
+        let mut cursor = Cursor::new(bytes);
+        let length = u64::try_from(bytes.len()).unwrap_or(u64::MAX);
+        while cursor.position() < length && self.over.is_none() {
+            let events = self.protocol.recv(&mut cursor);
+            self.handle(events);
+        }
+    }
+
+    fn fire(&mut self) {
+        let now = TokioInstant::now();
+        if self.unanswered.is_some_and(|since| now >= since + STALL) {
+            let seconds = STALL.as_secs();
+            self.over = Some(format!("the broker does not answer for {seconds} s"));
+            return;
+        }
+        if self.is_connected() && now >= self.next_ping {
+            self.next_ping = now + PING;
+            self.unanswered.get_or_insert(now);
+            match packets::ping(self.version) {
+                Ok(packet) => self.send(packet),
+                Err(error) => warn!(?error, "cannot ping the broker"),
+            }
+        }
+        let due: Vec<TimerKind> = self
+            .timers
+            .values()
+            .filter(|(_, at)| *at <= now)
+            .map(|(kind, _)| *kind)
+            .collect();
+        for kind in due {
+            self.timers.remove(&key(kind));
+            let events = self.protocol.notify_timer_fired(kind);
+            self.handle(events);
+        }
+    }
+
+    fn handle(&mut self, events: Vec<GenericEvent<u16>>) {
+        for event in events {
+            match event {
+                GenericEvent::RequestSendPacket { packet, .. } => {
+                    self.out.0.extend_from_slice(&packet.to_continuous_buffer());
+                }
+                GenericEvent::NotifyPacketReceived(packet) => self.packet(packet),
+                GenericEvent::NotifyPacketIdReleased(id) => {
+                    self.unconfirmed.remove(&id);
+                }
+                GenericEvent::RequestTimerReset { kind, duration_ms } => {
+                    let at = TokioInstant::now() + Duration::from_millis(duration_ms);
+                    self.timers.insert(key(kind), (kind, at));
+                }
+                GenericEvent::RequestTimerCancel(kind) => {
+                    self.timers.remove(&key(kind));
+                }
+                GenericEvent::NotifyError(error) => {
+                    debug!(?error, "a packet of the broker is not accepted");
+                }
+                GenericEvent::RequestClose => {
+                    let why = "the broker violated the protocol, or refused it";
+                    self.over.get_or_insert_with(|| why.to_owned());
+                }
+            }
+        }
+    }
+
+    fn packet(&mut self, packet: Packet) {
+        match packets::event(packet) {
+            Event::Accepted(accepted) => self.accepted(accepted),
+            Event::Refused { why, version } => {
+                self.refuses_version = version;
+                self.over = Some(why);
+            }
+            Event::Message(message) => self.messages.push(message),
+            Event::NotSubscribed => warn!(
+                "the broker refuses a subscription: allow the client to read the topics of its prefix"
+            ),
+            Event::Ended(why) => self.over = Some(why),
+            Event::Other => {}
+        }
+    }
+
+    fn accepted(&mut self, Accepted { max_packet }: Accepted) {
+        let broker = &self.settings.broker;
+        for filter in topics::filters(broker) {
+            let Ok(id) = self.protocol.acquire_packet_id() else {
+                return;
+            };
+            match packets::subscribe(&filter, (self.version, id, broker.at_least_once)) {
+                Ok(packet) => self.send(packet),
+                Err(error) => warn!(?error, filter, "cannot subscribe at the broker"),
+            }
+        }
+        let mut state = self.shared.state();
+        state.connections += 1;
+        state.queue.discard();
+        let now = instant();
+        let State { queue, kept, .. } = &mut *state;
+        for publication in kept.values() {
+            // The queue is empty, and what does not fit is published again later.
+            let _full = queue.push(publication.clone(), now).is_err();
+        }
+        state.link = Link::Connected {
+            at: self.at,
+            version: self.version,
+            max_packet,
+        };
+        info!(broker = %broker.address, version = ?self.version, "connected with the MQTT broker");
+    }
+
+    /// Ends the session in order: the broker discards the will, and everything written arrives.
+    async fn finish(&mut self, stream: &mut Box<dyn Stream>) {
+        if let Ok(packet) = packets::disconnect(self.version) {
+            self.send(packet);
+        }
+        let last = async {
+            let rest = self.out.0.get(self.out.1..).unwrap_or_default();
+            stream.write_all(rest).await?;
+            stream.shutdown().await?;
+            let mut rest = [0; 256];
+            while stream.read(&mut rest).await? > 0 {}
+            Ok::<_, io::Error>(())
+        };
+        if timeout(FINISH, last).await.is_err() {
+            debug!("the broker did not close the connection in time");
+        }
+    }
+}
+
+fn lost(error: &io::Error) -> String {
+    format!("the connection with the broker was lost: {error}")
+}
+
+const fn key(kind: TimerKind) -> u8 {
+    match kind {
+        TimerKind::PingreqSend => 0,
+        TimerKind::PingreqRecv => 1,
+        TimerKind::PingrespRecv => 2,
+    }
+}
+
+/// Returns the time for the queue.
+pub(crate) fn instant() -> Instant {
+    TokioInstant::now().into_std()
+}
+
+/// The time without an answer after which a broker is left.
+pub const STALL: Duration = Duration::from_secs(3);
+/// The interval of pings.
+const PING: Duration = Duration::from_secs(1);
+/// The time for the acceptance of a connection.
+const ACCEPT: Duration = Duration::from_secs(5);
+/// The time for the orderly end of a connection.
+const FINISH: Duration = Duration::from_secs(1);
+/// The first and the longest pause before a reconnection.
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+const LAST_PAUSE: Duration = Duration::from_secs(10);
+/// The size of the read buffer, and the number of bytes that are written at once.
+const READ: usize = 64 << 10;
+const WRITE: usize = 16 << 10;
+/// The most publications without confirmation; brokers accept at least 20 at a time by default.
+const MAX_UNCONFIRMED: usize = 20;

@@ -1,0 +1,344 @@
+//! Received JSON messages, of every layout and encoding.
+
+use json_values::{FieldValue, iso_time};
+use serde_json::{Map, Value};
+use uadp::discovery::{ConnectionState, CyclicStatus};
+use uadp::{
+    DataSetHeader, DateTime, Encoded, GroupHeader, NetworkHeader, NetworkMessageEncoder,
+    PublisherId, Variant,
+};
+
+use super::{Field, Json, Triple};
+use crate::topics::Address;
+
+/// The contents of a JSON message.
+#[derive(Debug, Default, PartialEq)]
+pub(crate) struct Reading {
+    /// NetworkMessages of UADP.
+    pub(crate) messages: Vec<Vec<u8>>,
+    pub(crate) status: Option<(ConnectionState, Option<CyclicStatus>)>,
+    /// Keys of payloads that the metadata does not have, and DataSetMessages that cannot be read.
+    pub(crate) faults: Vec<&'static str>,
+}
+
+/// The ids that a message inherits from its topic and its headers.
+#[derive(Debug, Clone, Copy)]
+struct Inherited {
+    publisher: u16,
+    group: Option<u16>,
+    writer: Option<u16>,
+    sent: Option<DateTime>,
+}
+
+impl Json {
+    /// Reads a message of a topic.
+    ///
+    /// # Errors
+    /// The reason why the whole message is dropped.
+    pub(crate) fn read(&mut self, text: &[u8], address: Address) -> Result<Reading, &'static str> {
+        let json: Value = serde_json::from_slice(text).map_err(|_| "malformed_json")?;
+        let mut inherited = Inherited {
+            publisher: address.publisher,
+            group: address.group,
+            writer: address.writer,
+            sent: None,
+        };
+        let Value::Object(whole) = &json else {
+            // Without a NetworkMessage header the message is an array of DataSetMessages.
+            return match json.as_array() {
+                Some(list) => Ok(self.data(list, inherited)),
+                None => Err("malformed_json"),
+            };
+        };
+        if let Some(id) = whole.get("PublisherId")
+            && number(id) != Some(address.publisher)
+        {
+            return Err("other_publisher");
+        }
+        let group = whole.get("WriterGroupName").and_then(number);
+        inherited.group = inherited.group.or(group);
+        let writer = whole.get("DataSetWriterId").and_then(number);
+        inherited.writer = inherited.writer.or(writer);
+        inherited.sent = whole.get("MessageId").and_then(sent);
+        match whole.get("MessageType").and_then(Value::as_str) {
+            Some("ua-metadata") => {
+                let (Some(group), Some(writer)) = (inherited.group, inherited.writer) else {
+                    return Err("json_ids");
+                };
+                let topic = (inherited.publisher, group, writer);
+                let meta_data = whole.get("MetaData").unwrap_or(&Value::Null);
+                let announcement = self.others.read(topic, meta_data);
+                Ok(Reading {
+                    messages: vec![announcement.ok_or("malformed_json")?],
+                    ..Reading::default()
+                })
+            }
+            Some("ua-status") => Ok(Reading {
+                status: Some(status(whole).ok_or("malformed_json")?),
+                ..Reading::default()
+            }),
+            _ => Ok(match whole.get("Messages") {
+                Some(Value::Array(list)) => self.data(list, inherited),
+                Some(one) => self.data(std::slice::from_ref(one), inherited),
+                None => self.data(std::slice::from_ref(&json), inherited),
+            }),
+        }
+    }
+
+    fn data(&self, list: &[Value], inherited: Inherited) -> Reading {
+        let mut reading = Reading::default();
+        for message in list {
+            match self.data_set(message, inherited, &mut reading.faults) {
+                Ok(bytes) => reading.messages.push(bytes),
+                Err(fault) => reading.faults.push(fault),
+            }
+        }
+        reading
+    }
+
+    /// Converts a DataSetMessage, or a bare payload.
+    fn data_set(
+        &self,
+        message: &Value,
+        inherited: Inherited,
+        faults: &mut Vec<&'static str>,
+    ) -> Result<Vec<u8>, &'static str> {
+        let whole = message.as_object().ok_or("malformed_json")?;
+        let kind = whole
+            .get("MessageType")
+            .and_then(Value::as_str)
+            .unwrap_or_default();
+        let is_keep_alive = kind == "ua-keepalive";
+        let has_header = whole.contains_key("Payload") || is_keep_alive;
+        let empty = Map::new();
+        let header = if has_header { whole } else { &empty };
+        let group = header
+            .get("WriterGroupName")
+            .and_then(number)
+            .or(inherited.group);
+        let ids = ["DataSetWriterId", "DataSetWriterName"];
+        let writer = ids.iter().find_map(|key| number(header.get(*key)?));
+        let writer = inherited.writer.or(writer);
+        let (Some(group), Some(writer)) = (group, writer) else {
+            return Err("json_ids");
+        };
+        let topic = (inherited.publisher, group, writer);
+        let taken = header
+            .get("Timestamp")
+            .and_then(Value::as_str)
+            .and_then(iso_time::parse);
+        let sequence = header.get("SequenceNumber").and_then(Value::as_u64);
+        let version = header
+            .get("MetaDataVersion")
+            .and_then(|of| of.get("MajorVersion"));
+        let version = version.and_then(Value::as_u64);
+        let data_set_header = DataSetHeader {
+            // The number is a UInt32 in JSON, and counts on.
+            sequence_number: sequence.map(low_word),
+            timestamp: taken,
+            status: header
+                .get("Status")
+                .and_then(code)
+                .map(|code| high_word(code)),
+            major_version: version.and_then(|version| u32::try_from(version).ok()),
+            ..DataSetHeader::default()
+        };
+        let network = NetworkHeader {
+            publisher_id: Some(PublisherId::UInt16(inherited.publisher)),
+            group: Some(GroupHeader {
+                writer_group_id: Some(group),
+                ..GroupHeader::default()
+            }),
+            timestamp: inherited.sent,
+            ..NetworkHeader::default()
+        };
+        let mut bytes = Vec::new();
+        let mut encoder = NetworkMessageEncoder::new(&mut bytes, &network, Some(&[writer]))
+            .map_err(|_| "malformed_json")?;
+        if is_keep_alive {
+            encoder
+                .keep_alive(&data_set_header)
+                .map_err(|_| "malformed_json")?;
+        } else {
+            let payload = match has_header {
+                true => header.get("Payload").and_then(Value::as_object),
+                false => Some(whole),
+            };
+            let payload = payload.ok_or("malformed_json")?;
+            let fields = self.fields(topic, payload, faults)?;
+            let written = match kind {
+                "ua-deltaframe" => delta(&mut encoder, &data_set_header, &fields),
+                _ => frame(&mut encoder, (&data_set_header, kind), &fields),
+            };
+            written.ok_or("malformed_json")?;
+        }
+        encoder.finish().map_err(|_| "malformed_json")?;
+        Ok(bytes)
+    }
+
+    /// Returns the Variants of a payload by their index; `None` for a field that is not there.
+    fn fields(
+        &self,
+        topic: Triple,
+        payload: &Map<String, Value>,
+        faults: &mut Vec<&'static str>,
+    ) -> Result<Vec<Option<Vec<u8>>>, &'static str> {
+        let Some(described) = self.others.of(topic) else {
+            // The order of several fields is unknown without metadata.
+            let mut values = payload.values();
+            return match (values.next(), values.next()) {
+                (Some(value), None) => Ok(vec![Some(variant(value, None)?)]),
+                _ => Err("undescribed_json"),
+            };
+        };
+        let is_known = |key: &String| described.iter().any(|field| field.name == *key);
+        if payload.keys().any(|key| !is_known(key)) {
+            faults.push("unknown_field");
+        }
+        let value = |field: &Field| {
+            let value = payload.get(&field.name);
+            value.map(|value| variant(value, Some(field))).transpose()
+        };
+        described.iter().map(value).collect()
+    }
+}
+
+/// Writes a key frame or event. A missing field is null.
+fn frame(
+    encoder: &mut NetworkMessageEncoder<'_>,
+    (header, kind): (&DataSetHeader, &str),
+    fields: &[Option<Vec<u8>>],
+) -> Option<()> {
+    let mut frame = match kind {
+        "ua-event" => encoder.event(header).ok()?,
+        _ => encoder.key_frame(header).ok()?,
+    };
+    for field in fields {
+        match field {
+            Some(bytes) => {
+                let value = Encoded::<Variant<'_>>::new(bytes).ok()?.get().ok()?;
+                frame.variant(&value).ok()?;
+            }
+            None => frame.null().ok()?,
+        }
+    }
+    frame.finish().ok()
+}
+
+fn delta(
+    encoder: &mut NetworkMessageEncoder<'_>,
+    header: &DataSetHeader,
+    fields: &[Option<Vec<u8>>],
+) -> Option<()> {
+    let mut frame = encoder.delta_frame(header).ok()?;
+    for (field, index) in fields.iter().zip(0..) {
+        if let Some(bytes) = field {
+            let value = Encoded::<Variant<'_>>::new(bytes).ok()?.get().ok()?;
+            frame.field(index).ok()?.variant(&value).ok()?;
+        }
+    }
+    frame.finish().ok()
+}
+
+/// Returns the bytes of a Variant: with its type (UaType and Value, Type and Body), as a DataValue,
+/// or plain and with the type of the metadata.
+fn variant(json: &Value, field: Option<&Field>) -> Result<Vec<u8>, &'static str> {
+    if let Some(whole) = json.as_object() {
+        let typed = [("UaType", "Value"), ("Type", "Body")]
+            .iter()
+            .find_map(|(kind, value)| Some((whole.get(*kind)?, whole.get(*value))));
+        if let Some((kind, value)) = typed {
+            let kind = kind.as_u64().and_then(|id| u8::try_from(id).ok());
+            let dimensions = ["Dimensions", "UaDimensions"]
+                .iter()
+                .find_map(|key| whole.get(*key));
+            let dimensions = dimensions.and_then(Value::as_array).map(|list| {
+                let number = |of: &Value| of.as_u64().and_then(|of| u32::try_from(of).ok());
+                list.iter().filter_map(number).collect::<Vec<u32>>()
+            });
+            let is_matrix = dimensions.as_ref().is_some_and(|of| of.len() > 1);
+            return encoded(FieldValue {
+                ua_type: Some(kind.ok_or("malformed_json")?),
+                value: value.cloned(),
+                dimensions: dimensions.filter(|_| is_matrix),
+                ..FieldValue::default()
+            });
+        }
+        // A DataValue of version 1.04, or of a stack that leaves the type out.
+        let is_data_value = field.is_none_or(|field| !is_structure(field));
+        if let Some(value) = whole.get("Value").filter(|_| is_data_value) {
+            return variant(value, field);
+        }
+    }
+    let builtin = match (field.map(|field| field.builtin), json) {
+        (_, Value::Null) => return encoded(FieldValue::default()),
+        (Some(Some(builtin)), _) => builtin,
+        (_, Value::Bool(_)) => uadp::BuiltinType::Boolean,
+        (_, Value::String(_)) => uadp::BuiltinType::String,
+        // The type of a number or structure is unknown.
+        _ => return Err("undescribed_json"),
+    };
+    encoded(FieldValue {
+        ua_type: Some(builtin.id()),
+        value: Some(json.clone()),
+        ..FieldValue::default()
+    })
+}
+
+fn is_structure(field: &Field) -> bool {
+    field.builtin == Some(uadp::BuiltinType::ExtensionObject)
+}
+
+fn encoded(value: FieldValue) -> Result<Vec<u8>, &'static str> {
+    json_values::variant_bytes(&value).map_err(|_| "wrong_json_value")
+}
+
+fn status(whole: &Map<String, Value>) -> Option<(ConnectionState, Option<CyclicStatus>)> {
+    let state = i32::try_from(whole.get("Status")?.as_i64()?).ok()?;
+    let time = |key: &str| iso_time::parse(whole.get(key)?.as_str()?);
+    let is_cyclic = whole
+        .get("IsCyclic")
+        .and_then(Value::as_bool)
+        .unwrap_or_default();
+    let cyclic = is_cyclic.then(|| CyclicStatus {
+        next_report_time: time("NextReportTime").unwrap_or_default(),
+        timestamp: time("Timestamp").unwrap_or_default(),
+    });
+    Some((ConnectionState(state), cyclic))
+}
+
+/// Reads an id: a number, or its decimal text.
+fn number(json: &Value) -> Option<u16> {
+    match json.as_str() {
+        Some(text) => text.parse().ok(),
+        None => u16::try_from(json.as_u64()?).ok(),
+    }
+}
+
+/// Reads a StatusCode: a number or an object with a Code. An object without Code is Good.
+fn code(json: &Value) -> Option<u32> {
+    let number = match json.as_object() {
+        Some(whole) => match whole.get("Code") {
+            Some(code) => code,
+            None => return Some(0),
+        },
+        None => json,
+    };
+    u32::try_from(number.as_u64()?).ok()
+}
+
+/// Returns the time of sending with which a MessageId of this project begins.
+fn sent(id: &Value) -> Option<DateTime> {
+    let (time, _) = id.as_str()?.split_once("Z-")?;
+    iso_time::parse(&format!("{time}Z"))
+}
+
+fn low_word(number: u64) -> u16 {
+    let [low, high, ..] = number.to_le_bytes();
+    u16::from_le_bytes([low, high])
+}
+
+fn high_word(code: u32) -> u16 {
+    let [high, low, ..] = code.to_be_bytes();
+    u16::from_be_bytes([high, low])
+}

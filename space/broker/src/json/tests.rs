@@ -1,0 +1,260 @@
+//! Tests of the JSON mapping: own messages are read as they were written, in every form, and
+//! messages of other stacks in every layout.
+
+use serde_json::json;
+use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, FieldMetaData, List};
+use uadp::{
+    BuiltinType, DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId,
+    Scalar, SecurityHeader,
+};
+
+use super::*;
+use crate::topics::{Address, MessageType};
+
+const TOPIC: Address = Address {
+    kind: MessageType::Data,
+    publisher: 1,
+    group: Some(2),
+    writer: Some(10),
+};
+
+const FORMS: [MessageMapping; 4] = [
+    MessageMapping::JsonVerbose,
+    MessageMapping::JsonCompact,
+    MessageMapping::JsonReversible,
+    MessageMapping::JsonNonReversible,
+];
+
+fn now() -> Timestamp {
+    Timestamp::from_unix_nanos(1_700_000_000_123_456_700)
+}
+
+/// Returns an announcement of the fields a to e.
+fn announcement() -> Vec<u8> {
+    let field = |name, builtin: BuiltinType, value_rank| FieldMetaData {
+        name: Some(name),
+        built_in_type: builtin.id(),
+        value_rank,
+        ..FieldMetaData::default()
+    };
+    let fields = [
+        field("zone", BuiltinType::Double, -1),
+        field("count", BuiltinType::Int64, -1),
+        field("axes", BuiltinType::Float, 1),
+        field("label", BuiltinType::String, -1),
+        field("blob", BuiltinType::ByteString, -1),
+    ];
+    let announcement = Announcement {
+        sequence_number: 1,
+        announced: Announced::DataSetMetaData {
+            writer_id: 10,
+            meta_data: DataSetMetaDataType {
+                name: Some("ua_1_2_10 arm"),
+                fields: List::new(&fields),
+                ..DataSetMetaDataType::default()
+            },
+            status: StatusCode::GOOD,
+        },
+    };
+    let mut bytes = Vec::new();
+    announcement
+        .encode(PublisherId::UInt16(1), SecurityHeader::NONE, &mut bytes)
+        .unwrap();
+    bytes
+}
+
+fn value() -> Vec<u8> {
+    let network = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(1)),
+        group: Some(GroupHeader {
+            writer_group_id: Some(2),
+            ..GroupHeader::default()
+        }),
+        timestamp: Some(now().time),
+        ..NetworkHeader::default()
+    };
+    let header = DataSetHeader {
+        sequence_number: Some(7),
+        timestamp: Some(now().time),
+        status: Some(0x4090),
+        ..DataSetHeader::default()
+    };
+    let mut bytes = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&[10])).unwrap();
+    let mut frame = message.key_frame(&header).unwrap();
+    frame.scalar(Scalar::Double(f64::INFINITY)).unwrap();
+    frame.scalar(Scalar::Int64(i64::MIN)).unwrap();
+    frame.array(BuiltinType::Float, 2).unwrap();
+    frame.element(Scalar::Float(0.1)).unwrap();
+    frame.element(Scalar::Float(-2.5)).unwrap();
+    frame.scalar(Scalar::String(Some("a \"b\""))).unwrap();
+    frame
+        .scalar(Scalar::ByteString(Some(&[1, 2, 255])))
+        .unwrap();
+    frame.finish().unwrap();
+    message.finish().unwrap();
+    bytes
+}
+
+/// Returns converters of a sender and a receiver that know the metadata.
+fn both(form: MessageMapping) -> (Json, Json) {
+    let announcement = announcement();
+    let announcement = NetworkMessage::decode(&announcement).unwrap();
+    let (mut sender, mut receiver) = (Json::new(form), Json::new(MessageMapping::Uadp));
+    let described = sender.describe(&announcement, now()).unwrap();
+    let meta = Address {
+        kind: MessageType::MetaData,
+        ..TOPIC
+    };
+    let learned = receiver.read(&described, meta).unwrap();
+    let learned = NetworkMessage::decode(&learned.messages[0]).unwrap();
+    let (topic, meta_data) = descriptions::to_json(&learned).unwrap();
+    assert_eq!(
+        (topic, &meta_data["Name"]),
+        ((1, 2, 10), &json!("ua_1_2_10 arm"))
+    );
+    (sender, receiver)
+}
+
+#[test]
+fn a_value_is_read_as_it_was_written_in_every_form() {
+    let datagram = value();
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    for form in FORMS {
+        let (mut sender, mut receiver) = both(form);
+        let text = sender.value(&message, now()).unwrap();
+        let reading = receiver.read(&text, TOPIC).unwrap();
+        assert_eq!(reading.faults, [""; 0], "{form:?}");
+        assert_eq!(reading.messages, [datagram.clone()], "{form:?}");
+    }
+}
+
+#[test]
+fn verbose_json_is_plain_and_the_other_forms_carry_types() {
+    let datagram = value();
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    for (form, count) in FORMS.into_iter().zip([
+        json!("-9223372036854775808"),
+        json!({"UaType": 8, "Value": "-9223372036854775808"}),
+        json!({"Type": 8, "Body": "-9223372036854775808"}),
+        json!("-9223372036854775808"),
+    ]) {
+        let text = both(form).0.value(&message, now()).unwrap();
+        let whole: Value = serde_json::from_slice(&text).unwrap();
+        assert_eq!(whole["PublisherId"], "1");
+        let data = &whole["Messages"][0];
+        assert_eq!(data["Payload"]["count"], count);
+        let old = matches!(
+            form,
+            MessageMapping::JsonReversible | MessageMapping::JsonNonReversible
+        );
+        assert_eq!(data["DataSetWriterId"].is_string(), old);
+    }
+}
+
+/// Returns the only field of each message that is read from a text.
+fn read(receiver: &mut Json, text: &Value) -> Result<Vec<String>, &'static str> {
+    let reading = receiver.read(text.to_string().as_bytes(), TOPIC)?;
+    if let Some(fault) = reading.faults.first() {
+        return Err(fault);
+    }
+    let show = |bytes: &Vec<u8>| {
+        let message = NetworkMessage::decode(bytes).unwrap();
+        let data = message.messages().next().unwrap().unwrap();
+        let fields = data.fields().unwrap().map(|field| {
+            let shown = json_values::show_variant(&field.unwrap()).unwrap();
+            format!("{:?} {}", shown.ua_type, shown.value.unwrap_or_default())
+        });
+        fields.collect::<Vec<_>>().join(", ")
+    };
+    Ok(reading.messages.iter().map(show).collect())
+}
+
+#[test]
+fn every_layout_and_encoding_of_other_stacks_is_read() {
+    let mut unknown = Json::new(MessageMapping::Uadp);
+    let typed = json!({"UaType": 11, "Value": 1.5});
+    let message =
+        json!({"DataSetWriterId": "10", "SequenceNumber": 70_000, "Payload": {"v": typed}});
+    for text in [
+        json!({"MessageId": "x", "MessageType": "ua-data", "PublisherId": 1, "Messages": [message]}),
+        json!({"MessageType": "ua-data", "PublisherId": "1", "Messages": message}),
+        json!([message]),
+        message.clone(),
+        json!({"v": typed}),
+        json!({"v": {"Value": 1.5, "UaType": 11, "SourceTimestamp": "2026-01-01T00:00:00Z"}}),
+        json!({"v": {"Type": 11, "Body": 1.5}}),
+        json!({"v": {"Value": {"Type": 11, "Body": 1.5}, "SourcePicoSeconds": 3}}),
+    ] {
+        assert_eq!(
+            read(&mut unknown, &text).unwrap(),
+            ["Some(11) 1.5"],
+            "{text}"
+        );
+    }
+    // Plain values of unknown types are read where the type is certain only.
+    assert_eq!(
+        read(&mut unknown, &json!({"v": true})).unwrap(),
+        ["Some(1) true"]
+    );
+    assert_eq!(
+        read(&mut unknown, &json!({"v": 1})),
+        Err("undescribed_json")
+    );
+    assert_eq!(
+        read(&mut unknown, &json!({"v": true, "w": true})),
+        Err("undescribed_json")
+    );
+    let (_, mut known) = both(MessageMapping::JsonVerbose);
+    let plain = json!({"label": "x", "zone": 1, "count": "3", "axes": [1], "blob": null});
+    assert_eq!(
+        read(&mut known, &plain).unwrap(),
+        ["Some(11) 1.0, Some(8) \"3\", Some(10) [1.0], Some(12) \"x\", None null"]
+    );
+    let more = json!({"label": "x", "other": 1});
+    assert_eq!(read(&mut known, &more), Err("unknown_field"));
+    let delta = json!({"MessageType": "ua-deltaframe", "Payload": {"count": "4"}});
+    let reading = known.read(delta.to_string().as_bytes(), TOPIC).unwrap();
+    let delta = NetworkMessage::decode(&reading.messages[0]).unwrap();
+    let delta = delta.messages().next().unwrap().unwrap();
+    assert_eq!(delta.values().unwrap().next().unwrap().unwrap().index, 1);
+}
+
+#[test]
+fn faulty_messages_are_refused_with_their_fault() {
+    let (_, mut known) = both(MessageMapping::JsonVerbose);
+    for (text, fault) in [
+        (json!(3), "malformed_json"),
+        (
+            json!({"PublisherId": "2", "Messages": []}),
+            "other_publisher",
+        ),
+        (json!({"Payload": 3}), "malformed_json"),
+        (json!({"Payload": {"zone": "fast"}}), "wrong_json_value"),
+        (
+            json!({"Payload": {"zone": {"UaType": 99, "Value": 1}}}),
+            "wrong_json_value",
+        ),
+    ] {
+        assert_eq!(read(&mut known, &text), Err(fault), "{text}");
+    }
+    let refused = known.read(b"{", TOPIC);
+    assert_eq!(refused, Err("malformed_json"));
+}
+
+#[test]
+fn a_status_is_read_as_it_was_written() {
+    let mut json = Json::new(MessageMapping::JsonCompact);
+    let cyclic = CyclicStatus {
+        next_report_time: now().time,
+        timestamp: now().time,
+    };
+    for status in [
+        (ConnectionState::OPERATIONAL, Some(cyclic)),
+        (ConnectionState::ERROR, None),
+    ] {
+        let text = json.status(1, status, now());
+        let read = json.read(&text, TOPIC).unwrap();
+        assert_eq!(read.status, Some(status));
+    }
+}

@@ -1,0 +1,246 @@
+//! The packets of MQTT 3.1.1 and 5.0.
+
+use mappings::MqttVersion;
+use mqtt_protocol_core::mqtt;
+use mqtt_protocol_core::mqtt::packet::{
+    ContentType, MaximumPacketSize, MessageExpiryInterval, Packet, Property, Qos, SubEntry,
+    SubOpts, UserProperty, v3_1_1, v5_0,
+};
+use mqtt_protocol_core::mqtt::result_code::MqttError;
+
+use crate::queue::Publication;
+use crate::settings::Settings;
+
+/// A received publication.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Message {
+    pub(crate) topic: String,
+    pub(crate) payload: Vec<u8>,
+    pub(crate) retained: bool,
+}
+
+/// The response of a broker to a connection.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Accepted {
+    /// The largest packet that the broker takes.
+    pub(crate) max_packet: Option<u32>,
+}
+
+/// Returns the packet that opens a session without stored state.
+pub(crate) fn connect(settings: &Settings, version: MqttVersion) -> Result<Packet, MqttError> {
+    let id = settings.client_id.as_str();
+    let login = settings.credentials.as_ref();
+    Ok(match version {
+        MqttVersion::V3_1_1 => {
+            let mut connect = v3_1_1::Connect::builder()
+                .client_id(id)?
+                .clean_session(true)
+                .keep_alive(KEEP_ALIVE);
+            if let Some(login) = login {
+                connect = connect
+                    .user_name(login.user.as_str())?
+                    .password(login.password.as_str())?;
+            }
+            connect.build()?.into()
+        }
+        MqttVersion::V5 => {
+            let limit = MaximumPacketSize::new(MAX_RECEIVED)?;
+            let mut connect = v5_0::Connect::builder()
+                .client_id(id)?
+                .clean_start(true)
+                .keep_alive(KEEP_ALIVE)
+                .props(vec![Property::MaximumPacketSize(limit)]);
+            if let Some(login) = login {
+                connect = connect
+                    .user_name(login.user.as_str())?
+                    .password(login.password.as_str())?;
+            }
+            connect.build()?.into()
+        }
+    })
+}
+
+/// Returns the packet that subscribes a filter.
+pub(crate) fn subscribe(
+    filter: &str,
+    (version, id, confirmed): (MqttVersion, u16, bool),
+) -> Result<Packet, MqttError> {
+    let qos = if confirmed {
+        Qos::AtLeastOnce
+    } else {
+        Qos::AtMostOnce
+    };
+    let options = SubOpts::new().set_qos(qos);
+    Ok(match version {
+        MqttVersion::V3_1_1 => v3_1_1::Subscribe::builder()
+            .packet_id(id)
+            .entries(vec![SubEntry::new(filter, options)?])
+            .build()?
+            .into(),
+        // Own messages are not returned.
+        MqttVersion::V5 => v5_0::Subscribe::builder()
+            .packet_id(id)
+            .entries(vec![SubEntry::new(filter, options.set_nl(true))?])
+            .build()?
+            .into(),
+    })
+}
+
+/// Returns the packet of a publication. `id` is set for a publication that is confirmed.
+pub(crate) fn publish(
+    publication: Publication,
+    (version, id): (MqttVersion, Option<u16>),
+) -> Result<Packet, MqttError> {
+    let qos = match id {
+        Some(_) => Qos::AtLeastOnce,
+        None => Qos::AtMostOnce,
+    };
+    let Publication {
+        topic,
+        payload,
+        retained,
+        within,
+        message_type,
+        content_type,
+        ..
+    } = publication;
+    Ok(match version {
+        MqttVersion::V3_1_1 => {
+            let mut packet = v3_1_1::Publish::builder()
+                .topic_name(topic)?
+                .qos(qos)
+                .retain(retained)
+                .payload(payload);
+            if let Some(id) = id {
+                packet = packet.packet_id(id);
+            }
+            packet.build()?.into()
+        }
+        MqttVersion::V5 => {
+            let mut properties = Vec::new();
+            // An empty payload clears a retained message.
+            if !payload.is_empty() {
+                properties.push(Property::UserProperty(UserProperty::new(
+                    "UAMessageType",
+                    message_type,
+                )?));
+                properties.push(Property::ContentType(ContentType::new(content_type)?));
+            }
+            if let Some(within) = within {
+                let seconds = within.as_secs() + u64::from(within.subsec_nanos() > 0);
+                let seconds = u32::try_from(seconds).unwrap_or(u32::MAX);
+                let expiry = MessageExpiryInterval::new(seconds)?;
+                properties.push(Property::MessageExpiryInterval(expiry));
+            }
+            let mut packet = v5_0::Publish::builder()
+                .topic_name(topic)?
+                .qos(qos)
+                .retain(retained)
+                .props(properties)
+                .payload(payload);
+            if let Some(id) = id {
+                packet = packet.packet_id(id);
+            }
+            packet.build()?.into()
+        }
+    })
+}
+
+/// Returns the packet that ends a session.
+pub(crate) fn disconnect(version: MqttVersion) -> Result<Packet, MqttError> {
+    Ok(match version {
+        MqttVersion::V3_1_1 => v3_1_1::Disconnect::builder().build()?.into(),
+        MqttVersion::V5 => v5_0::Disconnect::builder().build()?.into(),
+    })
+}
+
+/// Returns the packet that the broker answers at once.
+pub(crate) fn ping(version: MqttVersion) -> Result<Packet, MqttError> {
+    Ok(match version {
+        MqttVersion::V3_1_1 => v3_1_1::Pingreq::builder().build()?.into(),
+        MqttVersion::V5 => v5_0::Pingreq::builder().build()?.into(),
+    })
+}
+
+/// A packet of interest.
+pub(crate) enum Event {
+    Accepted(Accepted),
+    Refused {
+        why: String,
+        version: bool,
+    },
+    Message(Message),
+    /// The broker refused a subscription.
+    NotSubscribed,
+    Ended(String),
+    Other,
+}
+
+/// Reads a received packet.
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "acknowledgements and packets of brokers are handled by the protocol library"
+)]
+pub(crate) fn event(packet: Packet) -> Event {
+    match packet {
+        Packet::V3_1_1Connack(packet) => {
+            let code = packet.return_code();
+            let version = code == mqtt::result_code::ConnectReturnCode::UnacceptableProtocolVersion;
+            match code.is_success() {
+                true => Event::Accepted(Accepted { max_packet: None }),
+                false => Event::Refused {
+                    why: format!("the broker refuses the connection: {code:?}"),
+                    version,
+                },
+            }
+        }
+        Packet::V5_0Connack(packet) => {
+            let code = packet.reason_code();
+            let version = code == mqtt::result_code::ConnectReasonCode::UnsupportedProtocolVersion;
+            match code == mqtt::result_code::ConnectReasonCode::Success {
+                true => Event::Accepted(Accepted {
+                    max_packet: packet.props().iter().find_map(|property| match property {
+                        Property::MaximumPacketSize(size) => Some(size.val()),
+                        _ => None,
+                    }),
+                }),
+                false => Event::Refused {
+                    why: format!("the broker refuses the connection: {code:?}"),
+                    version,
+                },
+            }
+        }
+        Packet::V3_1_1Publish(packet) => Event::Message(Message {
+            topic: packet.topic_name().to_owned(),
+            payload: packet.payload().as_slice().to_vec(),
+            retained: packet.retain(),
+        }),
+        Packet::V5_0Publish(packet) => Event::Message(Message {
+            topic: packet.topic_name().to_owned(),
+            payload: packet.payload().as_slice().to_vec(),
+            retained: packet.retain(),
+        }),
+        Packet::V3_1_1Suback(packet) => {
+            match packet.return_codes().iter().all(|code| code.is_success()) {
+                true => Event::Other,
+                false => Event::NotSubscribed,
+            }
+        }
+        Packet::V5_0Suback(packet) => {
+            match packet.reason_codes().iter().all(|code| code.is_success()) {
+                true => Event::Other,
+                false => Event::NotSubscribed,
+            }
+        }
+        Packet::V5_0Disconnect(packet) => Event::Ended(format!(
+            "the broker ended the connection: {:?}",
+            packet.reason_code()
+        )),
+        _ => Event::Other,
+    }
+}
+
+/// The time in seconds after which the broker may consider the program gone, times 1.5.
+const KEEP_ALIVE: u16 = 10;
+/// The largest packet in bytes that is received.
+pub(crate) const MAX_RECEIVED: u32 = 16 << 20;
