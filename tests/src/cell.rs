@@ -16,6 +16,8 @@ use nix::{
     sched::{CloneFlags, unshare},
 };
 
+use crate::mosquitto::{MOSQUITTO, MOSQUITTO_SUB};
+
 /// Third-party software that a test needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Peer {
@@ -38,6 +40,8 @@ pub enum Peer {
     Clock,
     /// Wireshark's tshark, from Debian or Ubuntu.
     Tshark,
+    /// The MQTT broker mosquitto and its command-line clients, from Debian or Ubuntu.
+    Mosquitto,
 }
 
 /// A distribution of ROS 2 that is available as a peer.
@@ -255,6 +259,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
         Peer::Ros2 => &[&jazzy, &kilted],
         Peer::NodeOpcua => &[&node_opcua],
         Peer::Tshark => &[Path::new(TSHARK)],
+        Peer::Mosquitto => &[Path::new(MOSQUITTO), Path::new(MOSQUITTO_SUB)],
     };
     match needed.iter().find(|path| !path.exists()) {
         None => Ok(()),

@@ -24,6 +24,7 @@ mod enclave;
 mod executor;
 mod host;
 mod judge;
+mod mosquitto;
 mod net;
 mod numbered;
 mod peers;
@@ -51,6 +52,7 @@ pub use enclave::{Governance, Keystore, Wiretap, has_security};
 pub use executor::{Executes, Executor};
 pub use host::{Cable, HERE, Host, THERE, WIRE, Wire};
 pub use judge::Judge;
+pub use mosquitto::BROKER;
 pub use net::{
     GROUP, UadpSocket, all_overflowed, group_member, http_answer, http_get, metrics, overflowed,
     xml_rpc,

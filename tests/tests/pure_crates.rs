@@ -99,6 +99,32 @@ fn transport_does_not_know_what_a_datagram_means() {
 }
 
 #[test]
+fn json_values_reaches_no_io_and_knows_no_space() {
+    does_not_reach("json-values", IMPURE);
+    does_not_reach(
+        "json-values",
+        &["messages", "mappings", "bridge-*", "tcpros", "transport"],
+    );
+}
+
+#[test]
+fn the_broker_knows_neither_ros_nor_the_router() {
+    does_not_reach(
+        "broker",
+        &[
+            "bridge-*",
+            "tcpros",
+            "rosrust*",
+            "ros2-client",
+            "rustdds",
+            "async-opcua",
+            "async-opcua-server",
+            "openssl*",
+        ],
+    );
+}
+
+#[test]
 fn the_shell_knows_no_ros_library() {
     does_not_reach(
         "bridge-node",

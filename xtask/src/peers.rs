@@ -37,6 +37,9 @@ const APT: &[&str] = &[
     "python3-trajectory-msgs",
     "topic-tools",
     "tshark",
+    // The MQTT broker and its command-line clients.
+    "mosquitto",
+    "mosquitto-clients",
     "iproute2",
     "valgrind",
     "python3-venv",

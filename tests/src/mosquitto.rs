@@ -1,0 +1,116 @@
+//! mosquitto, the MQTT broker, and its command-line clients, from Debian or Ubuntu.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+
+use crate::{Cell, Child, Started};
+
+pub(crate) const MOSQUITTO: &str = "/usr/sbin/mosquitto";
+pub(crate) const MOSQUITTO_SUB: &str = "/usr/bin/mosquitto_sub";
+
+/// The address of a cell's broker.
+pub const BROKER: &str = "mqtt://127.0.0.1:1883";
+
+const START: Duration = Duration::from_secs(20);
+
+impl Cell {
+    /// Starts mosquitto with a listener on port 1883 for everybody, and waits until it is ready.
+    #[must_use]
+    pub fn mosquitto(&self) -> Child {
+        self.mosquitto_with("listener 1883 127.0.0.1\nallow_anonymous true\n")
+    }
+
+    /// Starts mosquitto with this configuration, and waits until it is ready.
+    ///
+    /// # Panics
+    /// Panics if mosquitto does not start.
+    #[must_use]
+    pub fn mosquitto_with(&self, configuration: &str) -> Child {
+        let text = format!("user root\nlog_dest stderr\n{configuration}");
+        let file = self.file("mosquitto.conf", &text);
+        let mut broker = Started::new("mosquitto", Path::new(MOSQUITTO))
+            .args(["-v", "-c", file.to_str().unwrap()])
+            .start();
+        broker.wait_for_line("running", START);
+        broker
+    }
+
+    /// Starts mosquitto_sub with these arguments. It prints a JSON object for each message, without
+    /// its payload.
+    #[must_use]
+    pub fn mosquitto_sub(&self, args: &[&str]) -> Child {
+        let format = r#"{"topic":"%t","retain":%r,"type":"%P","content":"%C"}"#;
+        self.mosquitto_sub_as(format, args)
+    }
+
+    /// Starts mosquitto_sub, which prints a JSON object with its payload, a text, for each message.
+    #[must_use]
+    pub fn mosquitto_sub_texts(&self, args: &[&str]) -> Child {
+        self.mosquitto_sub_as("%j", args)
+    }
+
+    fn mosquitto_sub_as(&self, format: &str, args: &[&str]) -> Child {
+        Started::new("mosquitto_sub", Path::new(MOSQUITTO_SUB))
+            .args(["-h", "127.0.0.1", "-V", "5", "-F", format])
+            .args(args)
+            .ends_on(Signal::SIGINT)
+            .start()
+    }
+
+    /// Returns the topics of the retained messages at the broker that match a filter.
+    ///
+    /// # Panics
+    /// Panics if mosquitto_sub does not start.
+    #[must_use]
+    pub fn retained(&self, filter: &str) -> Vec<String> {
+        let output = Command::new(MOSQUITTO_SUB)
+            .args(["-h", "127.0.0.1", "-V", "5", "-F", "%t", "-W", "1"])
+            .args(["--retained-only", "-t", filter])
+            .stdin(Stdio::null())
+            .output()
+            .unwrap();
+        let text = String::from_utf8_lossy(&output.stdout);
+        let mut topics: Vec<String> = text.lines().map(str::to_owned).collect();
+        topics.sort();
+        topics.dedup();
+        topics
+    }
+
+    /// Makes an authority, and certificates of it for a broker at 127.0.0.1 and for a client.
+    ///
+    /// # Panics
+    /// Panics if openssl does not start, or refuses an argument.
+    pub fn broker_certificates(&self) {
+        let folder = self.folder();
+        fs::write(
+            folder.join("names.ext"),
+            "subjectAltName=IP:127.0.0.1,DNS:localhost\n",
+        )
+        .unwrap();
+        let openssl = |args: &str| {
+            let output = Command::new("openssl")
+                .args(args.split_whitespace())
+                .current_dir(folder)
+                .output()
+                .unwrap();
+            let told = String::from_utf8_lossy(&output.stderr);
+            assert!(output.status.success(), "openssl {args}: {told}");
+        };
+        let key = "-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes";
+        openssl(&format!(
+            "req -x509 {key} -keyout ca.key -out ca.pem -days 2 -subj /CN=authority"
+        ));
+        for name in ["broker", "client"] {
+            openssl(&format!(
+                "req {key} -keyout {name}.key -out {name}.csr -subj /CN={name}"
+            ));
+            openssl(&format!(
+                "x509 -req -in {name}.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days 2 -extfile names.ext -out {name}.pem"
+            ));
+        }
+    }
+}

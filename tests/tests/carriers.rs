@@ -1,0 +1,310 @@
+//! The carriers: each passes the same tests, UDP multicast and an MQTT broker.
+
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use broker::{Identity, Mqtt};
+use mappings::{Broker, BrokerAddress, MqttVersion, PubSub};
+use system_tests::{BROKER, Cell, Child, Peer};
+use tokio::time::timeout;
+use transport::{BUFFER, Carrier, Options, Outgoing, SendError, Udp};
+use uadp::{
+    DataSetHeader, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder, PublisherId,
+    Scalar, Variant,
+};
+
+const SOON: Duration = Duration::from_secs(30);
+
+/// A network to test.
+trait Network {
+    /// Joins the network as a program of the space.
+    fn join(&self, publisher: u16) -> Box<dyn Carrier>;
+    /// Takes the network away.
+    fn cut(&mut self);
+    /// Returns the network.
+    fn mend(&mut self);
+}
+
+struct Multicast;
+
+impl Network for Multicast {
+    fn join(&self, _publisher: u16) -> Box<dyn Carrier> {
+        let options = Options {
+            interface: Some("lo".to_owned()),
+            ..Options::new(PubSub::ADDRESS)
+        };
+        Box::new(Udp::open(&options).unwrap())
+    }
+
+    fn cut(&mut self) {
+        link("down");
+    }
+
+    fn mend(&mut self) {
+        link("up");
+        let route = ["route", "add", "224.0.0.0/4", "dev", "lo"];
+        assert!(Command::new("ip").args(route).status().unwrap().success());
+    }
+}
+
+fn link(state: &str) {
+    let set = ["link", "set", "lo", state];
+    assert!(Command::new("ip").args(set).status().unwrap().success());
+}
+
+struct Mosquitto<'c> {
+    cell: &'c Cell,
+    version: MqttVersion,
+    broker: Option<Child>,
+}
+
+impl Network for Mosquitto<'_> {
+    fn join(&self, publisher: u16) -> Box<dyn Carrier> {
+        let mut broker = Broker::new(BrokerAddress::parse(BROKER).unwrap());
+        broker.version = Some(self.version);
+        let identity = Identity {
+            program: "test".to_owned(),
+            publisher: Some(publisher),
+        };
+        Box::new(Mqtt::open(&broker, &identity).unwrap())
+    }
+
+    fn cut(&mut self) {
+        self.broker = None;
+    }
+
+    fn mend(&mut self) {
+        self.broker = Some(self.cell.mosquitto());
+    }
+}
+
+/// Returns a value of `ua_<publisher>_2_10`, with padding.
+fn value(publisher: u16, number: u32, padding: usize) -> Vec<u8> {
+    let network = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(publisher)),
+        group: Some(GroupHeader {
+            writer_group_id: Some(2),
+            ..GroupHeader::default()
+        }),
+        ..NetworkHeader::default()
+    };
+    let mut bytes = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&[10])).unwrap();
+    let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
+    frame.scalar(Scalar::UInt32(number)).unwrap();
+    frame
+        .scalar(Scalar::ByteString(Some(&vec![7; padding])))
+        .unwrap();
+    frame.finish().unwrap();
+    message.finish().unwrap();
+    bytes
+}
+
+/// Returns the sender and number of a value.
+fn read(bytes: &[u8]) -> (PublisherId<'_>, u32) {
+    let message = NetworkMessage::decode(bytes).unwrap();
+    let data = message.messages().next().unwrap().unwrap();
+    let field = data.fields().unwrap().next().unwrap().unwrap();
+    match field {
+        Variant::Scalar(Scalar::UInt32(number)) => (message.publisher_id().unwrap(), number),
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Returns the numbers that `from` sends until `last` arrives. Own messages are left out.
+async fn numbers(carrier: &mut dyn Carrier, from: u16, last: u32) -> Vec<u32> {
+    let mut buffer = vec![0; BUFFER];
+    let mut numbers = Vec::new();
+    let all = async {
+        loop {
+            let received = carrier.recv(&mut buffer).await.unwrap();
+            if Some(received.from) == carrier.source() {
+                continue;
+            }
+            let (publisher, number) = read(&buffer[..received.length]);
+            if publisher == PublisherId::UInt16(from) {
+                numbers.push(number);
+                if number == last {
+                    return;
+                }
+            }
+        }
+    };
+    timeout(SOON, all).await.expect("the last number arrives");
+    numbers
+}
+
+/// Sends numbers of a warm-up until each receiver has one: then all have joined.
+async fn meet(sender: &mut dyn Carrier, publisher: u16, receivers: &mut [&mut Box<dyn Carrier>]) {
+    let mut buffer = vec![0; BUFFER];
+    for receiver in receivers {
+        let start = Instant::now();
+        'next: loop {
+            assert!(
+                start.elapsed() < SOON,
+                "the receiver joins: {:?}",
+                receiver.lost()
+            );
+            let _not_yet = sender.try_send(&Outgoing::new(&value(publisher, WARM_UP, 0)));
+            let _change = (sender.follow(), receiver.follow());
+            let wait = timeout(Duration::from_millis(50), receiver.recv(&mut buffer));
+            while let Ok(received) = &wait_once(wait).await {
+                let (from, _) = read(&buffer[..received.length]);
+                if from == PublisherId::UInt16(publisher)
+                    && Some(received.from) != receiver.source()
+                {
+                    break 'next;
+                }
+                break;
+            }
+        }
+    }
+}
+
+async fn wait_once<F>(wait: F) -> Result<transport::Received, ()>
+where
+    F: Future<Output = Result<std::io::Result<transport::Received>, tokio::time::error::Elapsed>>,
+{
+    match wait.await {
+        Ok(Ok(received)) => Ok(received),
+        _ => Err(()),
+    }
+}
+
+const WARM_UP: u32 = u32::MAX;
+
+fn send(
+    carrier: &mut dyn Carrier,
+    publisher: u16,
+    number: u32,
+    padding: usize,
+) -> Result<(), SendError> {
+    carrier.try_send(&Outgoing::new(&value(publisher, number, padding)))
+}
+
+/// Runs the suite. `loses` is true for a network that may drop messages of a burst.
+async fn conforms(network: &mut dyn Network, loses: bool) {
+    let (mut a, mut b, mut c) = (network.join(1), network.join(2), network.join(3));
+    meet(a.as_mut(), 1, &mut [&mut b, &mut c]).await;
+
+    // Several programs receive each message, in the order of sending, and own messages are either
+    // not returned or have the own source.
+    for number in 0..100 {
+        send(a.as_mut(), 1, number, 0).unwrap();
+    }
+    for receiver in [&mut b, &mut c] {
+        let got = numbers(receiver.as_mut(), 1, 99).await;
+        let got: Vec<u32> = got
+            .into_iter()
+            .filter(|number| *number != WARM_UP)
+            .collect();
+        assert_eq!(got, (0..100).collect::<Vec<_>>());
+    }
+    meet(b.as_mut(), 2, &mut [&mut a]).await;
+
+    // A large message arrives whole.
+    send(a.as_mut(), 1, 100, 60_000).unwrap();
+    numbers(b.as_mut(), 1, 100).await;
+
+    // A program that joins late gets nothing that was sent before.
+    let mut late = network.join(4);
+    meet(a.as_mut(), 1, &mut [&mut late]).await;
+    send(a.as_mut(), 1, 101, 0).unwrap();
+    let got = numbers(late.as_mut(), 1, 101).await;
+    assert!(
+        got.iter().all(|number| [WARM_UP, 101].contains(number)),
+        "{got:?}"
+    );
+
+    // A flood does not block the sender: messages are refused at most. Afterwards all goes on.
+    for number in 1000..21_000 {
+        match send(a.as_mut(), 1, number, 1000) {
+            Ok(()) | Err(SendError::Busy) => {}
+            Err(other) => panic!("{other}"),
+        }
+    }
+    let mut number = 30_000;
+    let start = Instant::now();
+    loop {
+        assert!(start.elapsed() < SOON, "messages arrive after the flood");
+        number += 1;
+        let _may_be_busy = send(a.as_mut(), 1, number, 0);
+        let next = timeout(Duration::from_millis(100), numbers(b.as_mut(), 1, number)).await;
+        if let Ok(got) = next {
+            let of_flood = got.iter().filter(|number| (1000..21_000).contains(*number));
+            assert!(of_flood.clone().is_sorted(), "the order is kept");
+            assert!(loses || of_flood.count() > 0, "the flood arrives in part");
+            break;
+        }
+    }
+
+    // The network is lost and comes back: nothing that was sent meanwhile arrives.
+    network.cut();
+    until(SOON, || {
+        let _change = (a.follow(), b.follow());
+        a.lost().is_some() && b.lost().is_some()
+    })
+    .await;
+    for number in 40_000..40_010 {
+        let _refused = send(a.as_mut(), 1, number, 0);
+    }
+    network.mend();
+    until(SOON, || {
+        let _change = (a.follow(), b.follow());
+        a.lost().is_none() && b.lost().is_none()
+    })
+    .await;
+    meet(a.as_mut(), 1, &mut [&mut b]).await;
+    send(a.as_mut(), 1, 50_000, 0).unwrap();
+    let got = numbers(b.as_mut(), 1, 50_000).await;
+    assert!(
+        !got.iter().any(|number| (40_000..40_010).contains(number)),
+        "{got:?}"
+    );
+}
+
+/// Polls a condition without blocking the runtime.
+async fn until(deadline: Duration, mut condition: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !condition() {
+        assert!(start.elapsed() < deadline, "the network changes");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+fn run(test: impl Future<Output = ()>) {
+    let runtime = tokio::runtime::Builder::new_current_thread();
+    let runtime = { runtime }.enable_all().build().unwrap();
+    runtime.block_on(test);
+}
+
+#[test]
+fn udp_multicast_conforms() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    run(conforms(&mut Multicast, true));
+}
+
+fn mosquitto_conforms(version: MqttVersion) {
+    let Some(cell) = Cell::with(&[Peer::Mosquitto]) else {
+        return;
+    };
+    let broker = Some(cell.mosquitto());
+    let mut network = Mosquitto {
+        cell: &cell,
+        version,
+        broker,
+    };
+    run(conforms(&mut network, false));
+}
+
+#[test]
+fn mqtt_3_1_1_conforms() {
+    mosquitto_conforms(MqttVersion::V3_1_1);
+}
+
+#[test]
+fn mqtt_5_conforms() {
+    mosquitto_conforms(MqttVersion::V5);
+}
