@@ -135,6 +135,15 @@ impl Encoded {
         );
     }
 
+    /// Returns the NetworkMessage Timestamp.
+    pub(crate) fn time(&self) -> Option<Timestamp> {
+        let (time, rest) = self.bytes.get(self.timestamp_at..)?.split_first_chunk()?;
+        Some(Timestamp {
+            time: DateTime(i64::from_le_bytes(*time)),
+            picoseconds: u16::from_le_bytes(*rest.first_chunk()?),
+        })
+    }
+
     /// Returns the DataSetMessage.
     pub(crate) fn data_set_message(&self) -> &[u8] {
         self.bytes.get(self.payload_at..).unwrap_or_default()

@@ -460,12 +460,18 @@ fn a_command_that_a_broker_delivers_late_is_dropped_and_counted() {
             authorized: false,
             limit: None,
         };
-        cell.programs[1].router.set_relay(Some(relay));
+        for program in &mut cell.programs {
+            program.router.set_relay(Some(relay));
+        }
         cell.write(of, 7);
-        let now = cell.now;
-        let held = cell.programs[0].turn(now);
-        cell.loses = Box::new(|_, _| true);
-        cell.run(Duration::from_millis(delay));
+        // The broker holds the command and its repetitions, whose times of sending are later.
+        let end = cell.now.monotonic + Duration::from_millis(delay);
+        let mut held = Vec::new();
+        while cell.now.monotonic < end {
+            let now = cell.now;
+            held.extend(cell.programs[0].turn(now));
+            cell.now = later(now, STEP);
+        }
         let now = cell.now;
         for datagram in &held {
             let router = &mut cell.programs[1].router;

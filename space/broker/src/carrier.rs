@@ -539,13 +539,14 @@ impl Carrier for Mqtt {
 
     fn dropped(&self) -> Vec<(&'static str, u64)> {
         let state = self.shared.state();
-        let queue = [
+        let counted = [
             ("queue_expired", state.queue.expired),
             ("queue_replaced", state.queue.replaced),
             ("connection_lost", state.queue.discarded),
+            ("received_overflow", state.overflow),
         ];
         let received = self.dropped.iter().map(|(reason, count)| (*reason, *count));
-        queue.into_iter().chain(received).collect()
+        counted.into_iter().chain(received).collect()
     }
 
     fn close(&mut self) {
@@ -651,7 +652,7 @@ const RETAINED: Duration = Duration::from_secs(300);
 /// Size in bytes of the headers and properties of a packet.
 const OVERHEAD: usize = 160;
 const LONGEST_TOPIC: usize = 64;
-/// The most messages that wait for the caller. When they wait, the broker waits.
+/// The most messages that wait for the caller; further messages are dropped.
 const MAX_RECEIVED: usize = 4096;
 const MAX_KEPT: usize = 65_536;
 const CLOSED_POLL: Duration = Duration::from_millis(10);

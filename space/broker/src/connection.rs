@@ -12,6 +12,7 @@ use mqtt_protocol_core::mqtt::common::Cursor;
 use mqtt_protocol_core::mqtt::connection::{ConnectionOptions, GenericEvent, TimerKind};
 use mqtt_protocol_core::mqtt::packet::{GenericPacketTrait as _, Packet};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, mpsc};
 use tokio::time::{Instant as TokioInstant, sleep, sleep_until, timeout};
 use tracing::{debug, info, warn};
@@ -39,6 +40,8 @@ pub(crate) struct State {
     /// The retained messages by topic. They are published again with each connection, because a
     /// broker may lose them.
     pub(crate) kept: BTreeMap<String, Publication>,
+    /// Number of received messages that were dropped because the program is too slow.
+    pub(crate) overflow: u64,
     closing: bool,
     closed: bool,
 }
@@ -241,8 +244,11 @@ impl<'a> Session<'a> {
                 return Ended::Lost(why);
             }
             for message in std::mem::take(&mut self.messages) {
-                if received.send((message, self.at)).await.is_err() {
-                    return Ended::Closed;
+                match received.try_send((message, self.at)) {
+                    Ok(()) => {}
+                    // Waiting would stop the connection in both directions.
+                    Err(TrySendError::Full(_)) => self.shared.state().overflow += 1,
+                    Err(TrySendError::Closed(_)) => return Ended::Closed,
                 }
             }
             if self.fill() {

@@ -19,10 +19,16 @@ impl Router {
         mut first: Encoded,
         now: Now,
     ) -> Option<Output> {
-        let others = self.gather(topic, &first);
+        // Each topic of a broker has its own messages.
+        let others = match self.relay {
+            None => self.gather(topic, &first),
+            Some(_) => Vec::new(),
+        };
         let with = others.iter().map(|(topic, _)| *topic).collect();
         if others.is_empty() {
-            first.stamp(now.utc);
+            if !self.keeps_time(topic) {
+                first.stamp(now.utc);
+            }
             return Some(Output::Datagram {
                 topic,
                 with,

@@ -49,6 +49,12 @@ impl Router {
         entry.is_some_and(|entry| entry.confirming.is_some())
     }
 
+    /// Returns whether the repetitions of a value carry the time of its first transmission. A
+    /// broker could deliver a repetition after the command was given up.
+    pub(super) fn keeps_time(&self, topic: TopicId) -> bool {
+        self.relay.is_some() && self.is_command(topic)
+    }
+
     /// Returns the headers of a request or a response. Over a broker they contain
     /// the time of sending.
     pub(super) fn action_header(&self, now: Now) -> NetworkHeader<'static> {

@@ -132,9 +132,12 @@ impl Router {
         }
         let (max_datagram, _) = self.sizes();
         let mut bytes = self.buffer();
+        let keeps_time = self.keeps_time(topic);
         let entry = self.topics.get_mut(&topic)?;
         let Sending { message, offset } = entry.sending.take()?;
-        let written = chunk(&mut bytes, topic, (&message, offset), max_datagram, now.utc);
+        let first = message.time().filter(|_| keeps_time);
+        let at = first.unwrap_or(now.utc);
+        let written = chunk(&mut bytes, topic, (&message, offset), max_datagram, at);
         if let Ok(offset) = written {
             if offset < message.data_set_message().len() {
                 entry.sending = Some(Sending { message, offset });
