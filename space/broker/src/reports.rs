@@ -65,7 +65,7 @@ impl Reports {
     pub(crate) fn connection(&mut self, publisher: u16, now: Instant) -> Option<Vec<u8>> {
         self.connection_due.take_if(|due| *due <= now)?;
         let name = |id: &u16| id.to_string();
-        let names: Vec<(u16, String, Vec<(u16, String)>)> = self
+        let names: Vec<NamedGroup> = self
             .groups
             .iter()
             .map(|(group, writers)| {
@@ -168,6 +168,9 @@ impl Reports {
         due
     }
 }
+
+/// A group with its name, and its writers with their names.
+type NamedGroup = (u16, String, Vec<(u16, String)>);
 
 /// The interval of the status.
 const STATUS_PERIOD: Duration = Duration::from_secs(2);

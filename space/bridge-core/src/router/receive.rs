@@ -190,17 +190,14 @@ impl Router {
         (from, sent): (SocketAddr, Option<Timestamp>),
         now: Now,
     ) {
+        let about = About {
+            topic: Some(topic),
+            from: Some(from),
+        };
         if !message.is_valid() {
-            self.count(
-                About {
-                    topic: Some(topic),
-                    from: Some(from),
-                },
-                Reason::Invalid,
-                1,
-                || "the writer marked its DataSetMessage as invalid".to_owned(),
-            );
-            return;
+            return self.count(about, Reason::Invalid, 1, || {
+                "the writer marked its DataSetMessage as invalid".to_owned()
+            });
         }
         let mut place = place(&message.header(), (from, sent));
         // Only key frames are repeated.
@@ -225,16 +222,11 @@ impl Router {
             relay.judge_value(&place, (confirming.as_deref(), *lasting), now.utc)
         });
         if let Some((case, detail)) = late {
-            let about = About {
-                topic: Some(topic),
-                from: Some(from),
-            };
             return self.count(about, late::cause(case), 1, || detail);
         }
         reader.heard(now.monotonic);
         // A keep-alive does not describe the content.
-        let changed = message.kind != MessageKind::KeepAlive
-            && reader.is_changed(message.header().major_version);
+        let changed = is_value && reader.is_changed(message.header().major_version);
         let mut admitted = match message.kind {
             // A keep-alive is only a sign of life.
             MessageKind::KeepAlive => None,
@@ -254,18 +246,7 @@ impl Router {
             Some(Err(Reason::Repeat)) => reader.is_good(now.monotonic),
             Some(_) => false,
         };
-        if returned {
-            self.tell_returned(topic);
-        }
-        if changed {
-            self.ask_what(topic, now);
-        }
-        self.retire(topic, now);
-        let entry = self.topics.get(&topic);
-        if entry.is_some_and(|entry| entry.timer.is_none()) {
-            // The port created the topic before its writer was received.
-            self.schedule(topic);
-        }
+        self.follow_up(topic, (returned, changed), now);
         if let Some(instance) = withdrawn {
             self.tell(Output::Retired { topic, instance });
         }
@@ -278,13 +259,26 @@ impl Router {
                 if reason == Reason::Repeat {
                     self.follow_again(topic, message, &place);
                 }
-                let about = About {
-                    topic: Some(topic),
-                    from: Some(from),
-                };
                 self.count(about, reason, 1, String::new);
             }
             Some(Ok(admitted)) => self.take_in(topic, message, (&place, &admitted, sent), now),
+        }
+    }
+
+    /// Carries out the consequences of a message for its topic: the end of a silence, and a probe for
+    /// a changed description.
+    fn follow_up(&mut self, topic: TopicId, (returned, changed): (bool, bool), now: Now) {
+        if returned {
+            self.tell_returned(topic);
+        }
+        if changed {
+            self.ask_what(topic, now);
+        }
+        self.retire(topic, now);
+        let entry = self.topics.get(&topic);
+        if entry.is_some_and(|entry| entry.timer.is_none()) {
+            // The port created the topic before its writer was received.
+            self.schedule(topic);
         }
     }
 

@@ -136,10 +136,7 @@ impl Json {
             // The number is a UInt32 in JSON, and counts on.
             sequence_number: sequence.map(low_word),
             timestamp: taken,
-            status: header
-                .get("Status")
-                .and_then(code)
-                .map(|code| high_word(code)),
+            status: header.get("Status").and_then(code).map(high_word),
             major_version: version.and_then(|version| u32::try_from(version).ok()),
             ..DataSetHeader::default()
         };

@@ -318,7 +318,7 @@ impl Router {
             },
             None if self
                 .relay
-                .map_or(from.ip().is_loopback(), |relay| relay.authorized) =>
+                .map_or_else(|| from.ip().is_loopback(), |relay| relay.authorized) =>
             {
                 RequestOrigin {
                     group: LOOPBACK,
