@@ -175,7 +175,7 @@ impl Commanded<'_> {
         self.cell.asyncua_once("opcua_write.py", &args)[0]["status"].clone()
     }
 
-    /// Writes new values until the robot confirms one.
+    /// Writes new values until the robot confirms a value.
     fn arrives(&mut self) {
         eventually("a command is confirmed", SOON * 2, || {
             self.value += 1.0;
@@ -290,7 +290,7 @@ fn a_command_is_never_delivered_late_by_a_broker() {
     commanded.never_arrives(1005.0);
     commanded.arrives();
 
-    // The broker restarts with what it has stored.
+    // The broker restarts with its stored messages.
     broker.signal(Signal::SIGSTOP);
     assert_eq!(commanded.write(1006.0), "BadTimeout");
     broker.signal(Signal::SIGTERM);

@@ -42,7 +42,7 @@ pub(crate) struct Status {
     /// Other applications of the group, as they describe themselves.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     applications: Vec<ApplicationStatus>,
-    /// The broker, if messages are carried by one.
+    /// The MQTT broker; `None` with UDP.
     #[serde(skip_serializing_if = "Option::is_none")]
     broker: Option<BrokerStatus>,
     /// Datagrams and messages without a topic.

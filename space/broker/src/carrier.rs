@@ -334,7 +334,7 @@ impl Mqtt {
         Ok(false)
     }
 
-    /// Handles retained messages whose publisher is Operational.
+    /// Handles the retained messages of an Operational publisher.
     fn release(&mut self, released: BTreeMap<String, Vec<u8>>, from: SocketAddr) {
         for (topic, payload) in released {
             let message = Message {

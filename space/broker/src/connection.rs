@@ -146,7 +146,7 @@ pub(crate) async fn run(
     }
 }
 
-/// One connection.
+/// A connection with the broker, from its start to its end.
 struct Session<'a> {
     settings: &'a Settings,
     shared: &'a Shared,

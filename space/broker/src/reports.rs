@@ -158,7 +158,7 @@ impl Reports {
         }
     }
 
-    /// Returns the stray topics whose time has come.
+    /// Returns the stray topics that are due.
     pub(crate) fn take_strays(&mut self, now: Instant) -> Vec<String> {
         let due = self.strays.iter().filter(|(_, at)| **at <= now);
         let due: Vec<String> = due.map(|(topic, _)| topic.clone()).collect();

@@ -132,7 +132,7 @@ pub struct Received {
     pub from: SocketAddr,
 }
 
-/// How far a carrier can tell senders apart.
+/// The distinction of senders.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Senders {
     /// Each sender has an address.
