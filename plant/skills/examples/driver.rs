@@ -1,0 +1,77 @@
+//! A skill with an own driver, run once and then halted in its second run.
+//!
+//! The driver stands for a gripper whose fingers need two seconds to close. It reports steps and
+//! progress, and stops when the skill is halted.
+
+use std::{error::Error, sync::Arc, time::Duration};
+
+use program::{Method, State};
+use skills::{
+    Authority, Driver, Facts, Owner, Results, Shown, Skill, TypeName, Value, Work, model,
+};
+
+const OPERATOR: Owner = Owner::Local("the example");
+
+struct Fingers;
+
+#[async_trait::async_trait]
+impl Driver for Fingers {
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let force = work.parameters().number("Force").unwrap_or_default();
+        work.step(format!("closing with {force} N")).await;
+        for tenth in 1..=10_u8 {
+            // Ends with an error on Halt; a real driver stops the machine here.
+            work.spend(Duration::from_millis(200)).await?;
+            work.progress(f32::from(tenth) / 10.0);
+        }
+        Ok(vec![("Gripped".to_owned(), Value::from(true))])
+    }
+}
+
+#[tokio::main(flavor = "current_thread")]
+async fn main() -> Result<(), Box<dyn Error>> {
+    let of = model::find("GraspSkillType").ok_or("the type is not in the model")?;
+    let facts = Facts {
+        name: "Grasp".to_owned(),
+        types: of.chain().map(|of| TypeName::own(of.name)).collect(),
+        parameters: of.parameters(),
+        results: of.results(),
+        capabilities: Vec::new(),
+        timeout: Some(Duration::from_secs(10)),
+        rests_in: of.rests_in,
+    };
+    let skill = Skill::spawn(facts, Arc::new(Fingers), Authority::new(), Vec::new());
+
+    let force = vec![("Force".to_owned(), Value::from(20.0))];
+    let run = skill.execute(OPERATOR, force.clone(), None).await?;
+    show(&ended(&skill, run).await?);
+
+    let run = skill.execute(OPERATOR, force, None).await?;
+    skill.call(OPERATOR, Method::Halt).await?;
+    show(&ended(&skill, run).await?);
+    skill.close().await;
+    Ok(())
+}
+
+/// Waits for the end of a run.
+async fn ended(skill: &Skill, run: u32) -> Result<Shown, Box<dyn Error>> {
+    let mut watch = skill.watch();
+    let shown = watch
+        .wait_for(|shown| shown.run == run && matches!(shown.state, State::Ready | State::Halted));
+    Ok(Shown::clone(&*shown.await?))
+}
+
+fn show(shown: &Shown) {
+    if let Some(outcome) = &shown.outcome {
+        println!(
+            "run {}: {:?}: {}",
+            outcome.run, shown.state, outcome.message
+        );
+        for line in &outcome.trace {
+            println!("  {line}");
+        }
+        for (name, value) in &outcome.results {
+            println!("  {name} = {}", value.to_json());
+        }
+    }
+}
