@@ -130,6 +130,7 @@ fn job(rows: &[&Row]) -> Result<Option<skills::Job>, String> {
         pick,
         place,
         approach: approach.unwrap_or(USUALLY_APPROACH),
+        shape: None,
     }))
 }
 

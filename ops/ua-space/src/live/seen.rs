@@ -14,7 +14,7 @@ use crate::exit::Failure;
 
 /// The contents of a group after some time of listening.
 pub(crate) struct Listened {
-    pub(crate) group: SocketAddr,
+    pub(crate) group: String,
     /// The announced applications, by space and address.
     pub(crate) applications: BTreeMap<(u16, String), Application>,
     pub(crate) topics: Vec<TopicSeen>,
@@ -78,7 +78,7 @@ pub(crate) async fn listened(group: &Group, seconds: f64) -> Result<Listened, Fa
     let dropped = live.book.dropped();
     let dropped = dropped.map(|(reason, count)| (reason.label().to_owned(), count));
     Ok(Listened {
-        group: live.group(),
+        group: live.group().to_owned(),
         applications: live.who().applications,
         topics: topics(&live),
         senders: senders.into_iter().map(timing).collect(),

@@ -93,7 +93,7 @@ async fn group(arguments: &Doctor) -> GroupFacts {
     };
     match listened(&arguments.group, seconds).await {
         Ok(heard) => {
-            facts.address = heard.group.to_string();
+            facts.address.clone_from(&heard.group);
             facts.applications = applications(heard.applications)
                 .into_iter()
                 .map(|(space, from, one)| Announced {
