@@ -259,6 +259,7 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
     }
     // No process has run, and no process is known.
     let expected = [
+        "objects",
         "process-parameters",
         "process-steps",
         "processes",
