@@ -1,6 +1,12 @@
 //! Prints the findings of a mapping, and the ROS topic of each value in each space:
 //! `routes MAPPING`.
 
+#![expect(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "the topics and findings are its output"
+)]
+
 use std::{env, error::Error, fs};
 
 use mappings::Mapping;

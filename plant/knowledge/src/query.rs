@@ -293,6 +293,21 @@ impl Drop for Stopping {
     }
 }
 
+/// Parses a query. An update is a fault of its own.
+fn parsed(text: &str) -> Result<spargebra::Query, QueryFault> {
+    match SparqlParser::new().parse_query(text) {
+        Ok(query) => Ok(query),
+        Err(_)
+            if SparqlParser::new()
+                .parse_update(text)
+                .is_ok_and(|update| !update.operations.is_empty()) =>
+        {
+            Err(QueryFault::NotAQuery)
+        }
+        Err(error) => Err(QueryFault::Malformed(error.to_string())),
+    }
+}
+
 struct Work {
     knowledge: Arc<Knowledge>,
     asked: Asked,
@@ -308,29 +323,17 @@ impl Work {
             Asked::Question(_, text) => (text, Dataset::default()),
             Asked::Update(text, at) => {
                 let update = update::read(text)?;
-                let updated = self.knowledge.update(&update, &self.token, *at);
-                return match updated {
+                return match self.knowledge.update(&update, &self.token, *at) {
                     Err(QueryFault::Failed(_)) if self.token.is_cancelled() => {
-                        Err(QueryFault::Time {
-                            limit: self.limits.time,
-                        })
+                        let limit = self.limits.time;
+                        Err(QueryFault::Time { limit })
                     }
                     updated => updated.map(Results::Updated),
                 };
             }
         };
         bounds::nests(text)?;
-        let query = match SparqlParser::new().parse_query(text) {
-            Ok(query) => query,
-            Err(_)
-                if SparqlParser::new()
-                    .parse_update(text)
-                    .is_ok_and(|update| !update.operations.is_empty()) =>
-            {
-                return Err(QueryFault::NotAQuery);
-            }
-            Err(error) => return Err(QueryFault::Malformed(error.to_string())),
-        };
+        let query = parsed(text)?;
         bounds::check(&query)?;
         let mut prepared = evaluator.for_query(query);
         if !dataset.default.is_empty() || !dataset.named.is_empty() {

@@ -189,16 +189,12 @@ impl<'a> Writing<'a> {
         };
         let written = &mut *self.written;
         if let Some(journal) = &mut written.journal {
-            let mut records = Vec::new();
-            for source in &self.removed {
-                if written
-                    .sources
-                    .get(source)
-                    .is_some_and(|known| known.lasting)
-                {
-                    records.push(Record::Remove { source });
-                }
-            }
+            let known = &written.sources;
+            let removed = self
+                .removed
+                .iter()
+                .filter(|source| known.get(*source).is_some_and(|known| known.lasting));
+            let mut records: Vec<_> = removed.map(|source| Record::Remove { source }).collect();
             if self.lasting == Lasting::Yes {
                 let puts = self.whole.iter();
                 records.extend(puts.map(|(source, triples)| Record::Put {
@@ -206,10 +202,8 @@ impl<'a> Writing<'a> {
                     at,
                     triples,
                 }));
-                let changes = self
-                    .changes
-                    .iter()
-                    .filter(|(source, _)| !self.removed.contains(*source));
+                let changes = self.changes.iter();
+                let changes = changes.filter(|(source, _)| !self.removed.contains(*source));
                 records.extend(changes.map(|(source, change)| Record::Change {
                     source,
                     at,

@@ -3,6 +3,8 @@
 //! The driver stands for a gripper whose fingers need two seconds to close. It reports steps and
 //! progress, and stops when the skill is halted.
 
+#![expect(clippy::print_stdout, reason = "the outcomes are its output")]
+
 use std::{error::Error, sync::Arc, time::Duration};
 
 use program::{Method, State};

@@ -139,15 +139,8 @@ impl ComponentServer {
         let authority = Authority::new();
         let mut served = Vec::new();
         let mut used = Vec::new();
-        for (
-            number,
-            Made {
-                facts,
-                driver,
-                nodes,
-            },
-        ) in (1..).zip(made)
-        {
+        for (number, made) in (1..).zip(made) {
+            let (facts, driver, nodes) = (made.facts, made.driver, made.nodes);
             let mut all: Vec<Box<dyn Observer>> =
                 vec![Box::new(Shower::new(server.clone(), Arc::clone(&nodes)))];
             all.extend(observers(number, &facts));
@@ -161,23 +154,14 @@ impl ComponentServer {
         }
         let skills: Vec<Skill> = served.iter().map(|(skill, _)| skill.clone()).collect();
         if let Some(power_off) = settings.power_off.clone() {
-            power::serve(
-                &server,
-                &root.node_id,
-                &mut ids,
-                &skills,
-                (power_off, users),
-            )
-            .map_err(|error| ServeFault::Space(error.to_string()))?;
+            let by = (power_off, users);
+            power::serve(&server, &root.node_id, &mut ids, &skills, by)
+                .map_err(|error| ServeFault::Space(error.to_string()))?;
         }
         let mut tasks = JoinSet::new();
         if let Some(device) = component.device.clone() {
-            if let Some(state) = device.tool_changer() {
-                let nodes = served.iter().map(|(_, nodes)| Arc::clone(nodes)).collect();
-                tasks.spawn(tool::show(server.clone(), nodes, state));
-            }
-            let peers = settings.peers.clone();
-            tasks.spawn(async move { device.tend(&peers).await });
+            let nodes = served.iter().map(|(_, nodes)| Arc::clone(nodes)).collect();
+            tend(&mut tasks, &server, nodes, (device, settings.peers.clone()));
         }
         let leases = Leases {
             server: server.clone(),
@@ -194,11 +178,8 @@ impl ComponentServer {
             tasks.spawn(kept.map_err(|error| ServeFault::Space(error.to_string()))?);
         }
         if let Some(node) = root.node("LeaseHolder") {
-            tasks.spawn(show_holder(
-                server.clone(),
-                node.clone(),
-                authority.holder(),
-            ));
+            let node = node.clone();
+            tasks.spawn(show_holder(server.clone(), node, authority.holder()));
         }
         Ok(Self {
             server,
@@ -320,6 +301,18 @@ struct Made {
     nodes: Arc<Nodes>,
 }
 
+/// Returns the remedy for a skill type that no NodeSet defines.
+fn help_for_type(skill_type: &TypeName) -> String {
+    let own = skill_type.namespace == NAMESPACE;
+    let names: Vec<&str> = model::TYPES.iter().map(|of| of.name).collect();
+    let near = crate::yaml::nearest(&skill_type.name, &names).filter(|_| own);
+    match near {
+        Some(near) => format!("did you mean `{near}`?"),
+        None if own => "types of others are named as nsu=<namespace uri>;<BrowseName>".to_owned(),
+        None => "the NodeSet with the type stands under `nodesets`".to_owned(),
+    }
+}
+
 /// Creates the instance of a skill's type, and its description.
 fn make(
     server: &Server,
@@ -336,19 +329,8 @@ fn make(
     } = setup;
     let wrong = |code, message: String| Finding::error(code, *place, message);
     let Some(type_id) = server.find_type(&skill_type.namespace, &skill_type.name) else {
-        let own = skill_type.namespace == NAMESPACE;
-        let names: Vec<&str> = model::TYPES.iter().map(|of| of.name).collect();
-        let near = crate::yaml::nearest(&skill_type.name, &names).filter(|_| own);
-        let help = match near {
-            Some(near) => format!("did you mean `{near}`?"),
-            None if own => {
-                "types of others are named as nsu=<namespace uri>;<BrowseName>".to_owned()
-            }
-            None => "the NodeSet with the type stands under `nodesets`".to_owned(),
-        };
-        return Err(
-            wrong(Code::SkillType, format!("there is no type {skill_type}")).with_help(help),
-        );
+        let message = format!("there is no type {skill_type}");
+        return Err(wrong(Code::SkillType, message).with_help(help_for_type(skill_type)));
     };
     let types = types::chain(server, &type_id);
     let root = TypeName::own(model::SKILL_TYPE);
@@ -487,6 +469,19 @@ impl Leases {
             }
         }
     }
+}
+
+/// Keeps the state of the device up to date, and shows the state of a tool changer.
+fn tend(
+    tasks: &mut JoinSet<()>,
+    server: &Server,
+    nodes: Vec<Arc<Nodes>>,
+    (device, peers): (Arc<dyn Device>, PeerAccess),
+) {
+    if let Some(state) = device.tool_changer() {
+        tasks.spawn(tool::show(server.clone(), nodes, state));
+    }
+    tasks.spawn(async move { device.tend(&peers).await });
 }
 
 async fn show_holder(server: Server, node: NodeId, mut holder: watch::Receiver<Option<Owner>>) {

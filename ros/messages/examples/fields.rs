@@ -1,6 +1,8 @@
 //! Prints the fields of a message type, and its md5 for ROS 1:
 //! `fields DIALECT TYPE [FILE.msg]`, for example `fields ros1 geometry_msgs/Twist`.
 
+#![expect(clippy::print_stdout, reason = "the fields are its output")]
+
 use std::{env, error::Error, fs};
 
 use messages::{Dialect, Registry};

@@ -370,19 +370,7 @@ impl Told for Status {
         }
         for (topic, call) in &self.calls {
             let labels = format!("{own},call=\"{topic}\"");
-            line("call_known", &labels, &u8::from(call.known));
-            line("calls_asked_total", &labels, &call.asked);
-            line("calls_answered_total", &labels, &call.answered);
-            line("calls_refused_total", &labels, &call.refused);
-            line("calls_unknown_total", &labels, &call.unknown);
-            line("calls_executed_total", &labels, &call.executed);
-            for (reason, count) in &call.dropped {
-                line(
-                    "calls_dropped_total",
-                    &format!("{labels},reason=\"{reason}\""),
-                    count,
-                );
-            }
+            call.figures(&labels, &mut line);
         }
         for (reason, count) in self.broker.iter().flat_map(|broker| &broker.dropped) {
             let labels = format!("{own},reason=\"{reason}\"");
@@ -398,6 +386,25 @@ impl Told for Status {
         }
         text.push_str(&self.topic_names(&own));
         text
+    }
+}
+
+impl CallStatus {
+    /// Passes the name, the labels and the value of each figure to `line`.
+    fn figures(&self, labels: &str, line: &mut impl FnMut(&str, &str, &dyn std::fmt::Display)) {
+        line("call_known", labels, &u8::from(self.known));
+        line("calls_asked_total", labels, &self.asked);
+        line("calls_answered_total", labels, &self.answered);
+        line("calls_refused_total", labels, &self.refused);
+        line("calls_unknown_total", labels, &self.unknown);
+        line("calls_executed_total", labels, &self.executed);
+        for (reason, count) in &self.dropped {
+            line(
+                "calls_dropped_total",
+                &format!("{labels},reason=\"{reason}\""),
+                count,
+            );
+        }
     }
 }
 

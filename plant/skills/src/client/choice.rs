@@ -248,7 +248,7 @@ fn object_of(outcome: &Outcome) -> Option<WorldObject> {
     Some(WorldObject {
         pose: numbers("Pose")?.try_into().ok()?,
         shape: shape
-            .or(cylinder.map(|[diameter, height]| PartShape::Cylinder { diameter, height })),
+            .or_else(|| cylinder.map(|[diameter, height]| PartShape::Cylinder { diameter, height })),
         mass: mass
             .and_then(|(_, mass)| mass.as_f64())
             .filter(|mass| *mass > 0.0),

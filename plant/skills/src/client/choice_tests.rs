@@ -255,7 +255,8 @@ async fn nothing_moves_without_the_object_a_tool_or_a_fitting_grasp() {
         ("ObjectId", "box"),
         ("ToolSkillControllerEndpoint", "urn:example:gripper"),
     ];
-    let cases: [(&[(&str, &str)], Option<&str>, &str); 5] = [
+    type Case<'a> = (&'a [(&'a str, &'a str)], Option<&'a str>, &'a str);
+    let cases: [Case<'_>; 5] = [
         (
             &unknown,
             Some("urn:test:cup"),

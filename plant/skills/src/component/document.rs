@@ -52,31 +52,33 @@ impl Component {
     }
 }
 
+/// Keys of the document.
+const KEYS: [&str; 17] = [
+    "component",
+    "application_uri",
+    "namespace",
+    "endpoint",
+    "security",
+    "nodesets",
+    "lds",
+    "open",
+    "lease",
+    "user",
+    "anonymous",
+    "limits",
+    "device",
+    "robot",
+    "world",
+    "power_off",
+    "skills",
+];
+
 fn component(
     root: &Node,
     folder: &Path,
     kinds: &dyn DeviceKinds,
     reader: &mut Reader<'_>,
 ) -> Option<Component> {
-    let keys = [
-        "component",
-        "application_uri",
-        "namespace",
-        "endpoint",
-        "security",
-        "nodesets",
-        "lds",
-        "open",
-        "lease",
-        "user",
-        "anonymous",
-        "limits",
-        "device",
-        "robot",
-        "world",
-        "power_off",
-        "skills",
-    ];
     let [
         name,
         uri,
@@ -95,7 +97,7 @@ fn component(
         world,
         power_off,
         skills,
-    ] = reader.map(root, keys)?;
+    ] = reader.map(root, KEYS)?;
     // All values are read, so that all errors are reported.
     let name = reader
         .needed(name, "component", root.place)

@@ -125,7 +125,7 @@ fn a_value_is_read_as_it_was_written_in_every_form() {
         let text = sender.value(&message, now()).unwrap();
         let reading = receiver.read(&text, TOPIC).unwrap();
         assert_eq!(reading.faults, [""; 0], "{form:?}");
-        assert_eq!(reading.messages, [datagram.clone()], "{form:?}");
+        assert_eq!(reading.messages, std::slice::from_ref(&datagram), "{form:?}");
     }
 }
 
@@ -180,7 +180,7 @@ fn every_layout_and_encoding_of_other_stacks_is_read() {
         json!({"MessageId": "x", "MessageType": "ua-data", "PublisherId": 1, "Messages": [message]}),
         json!({"MessageType": "ua-data", "PublisherId": "1", "Messages": message}),
         json!([message]),
-        message.clone(),
+        message,
         json!({"v": typed}),
         json!({"v": {"Value": 1.5, "UaType": 11, "SourceTimestamp": "2026-01-01T00:00:00Z"}}),
         json!({"v": {"Type": 11, "Body": 1.5}}),
