@@ -335,10 +335,8 @@ fn make(
     let types = types::chain(server, &type_id);
     let root = TypeName::own(model::SKILL_TYPE);
     let Some(last) = types.iter().position(|of| *of == root) else {
-        return Err(wrong(
-            Code::SkillType,
-            format!("{skill_type} is no subtype of SkillType"),
-        ));
+        let message = format!("{skill_type} is no subtype of SkillType");
+        return Err(wrong(Code::SkillType, message));
     };
     let types: Vec<TypeName> = types.into_iter().take(last + 1).collect();
     let driver = drivers
@@ -347,17 +345,12 @@ fn make(
     let changes_tools =
         drivers.has_tool_changer() && types.contains(&TypeName::own("ToolSkillType"));
     let first = number * IDS_PER_SKILL;
+    let of_tools = changes_tools.then_some(tool::PROPERTIES).into_iter();
+    let of_tools = of_tools.flatten().chain(["ProgramDiagnostic"]);
     let spec = InstanceSpec {
         event_notifier: true,
         optional: grip::properties(setup.grip_point.as_ref())
-            .chain(
-                changes_tools
-                    .then_some(tool::PROPERTIES)
-                    .into_iter()
-                    .flatten()
-                    .map(str::to_owned),
-            )
-            .chain(["ProgramDiagnostic".to_owned()])
+            .chain(of_tools.map(str::to_owned))
             .collect(),
         ..InstanceSpec::new(
             type_id,
@@ -476,7 +469,7 @@ fn tend(
     tasks: &mut JoinSet<()>,
     server: &Server,
     nodes: Vec<Arc<Nodes>>,
-    (device, peers): (Arc<dyn Device>, PeerAccess),
+    (device, peers): (Arc<dyn crate::component::Device>, PeerAccess),
 ) {
     if let Some(state) = device.tool_changer() {
         tasks.spawn(tool::show(server.clone(), nodes, state));

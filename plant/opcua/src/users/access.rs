@@ -619,9 +619,13 @@ mod tests {
             (access.roles_of_user("bert"), access.has_users()),
             (None, true)
         );
-        let roles = access.roles_by_password("anna", "correct horse", "SPARQL").await;
+        let roles = access
+            .roles_by_password("anna", "correct horse", "SPARQL")
+            .await;
         assert_eq!(roles, Roles::of(&[Role::Operator]));
-        let none = access.roles_by_password("anna", "correct house", "SPARQL").await;
+        let none = access
+            .roles_by_password("anna", "correct house", "SPARQL")
+            .await;
         assert_eq!(none, Roles::NONE);
         std::fs::remove_dir_all(folder).unwrap();
     }

@@ -247,8 +247,9 @@ fn object_of(outcome: &Outcome) -> Option<WorldObject> {
     let mass = outcome.results.iter().find(|(name, _)| name == "Mass");
     Some(WorldObject {
         pose: numbers("Pose")?.try_into().ok()?,
-        shape: shape
-            .or_else(|| cylinder.map(|[diameter, height]| PartShape::Cylinder { diameter, height })),
+        shape: shape.or_else(|| {
+            cylinder.map(|[diameter, height]| PartShape::Cylinder { diameter, height })
+        }),
         mass: mass
             .and_then(|(_, mass)| mass.as_f64())
             .filter(|mass| *mass > 0.0),

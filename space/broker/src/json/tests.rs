@@ -125,7 +125,11 @@ fn a_value_is_read_as_it_was_written_in_every_form() {
         let text = sender.value(&message, now()).unwrap();
         let reading = receiver.read(&text, TOPIC).unwrap();
         assert_eq!(reading.faults, [""; 0], "{form:?}");
-        assert_eq!(reading.messages, std::slice::from_ref(&datagram), "{form:?}");
+        assert_eq!(
+            reading.messages,
+            std::slice::from_ref(&datagram),
+            "{form:?}"
+        );
     }
 }
 
