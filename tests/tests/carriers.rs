@@ -139,7 +139,7 @@ async fn meet(sender: &mut dyn Carrier, publisher: u16, receivers: &mut [&mut Bo
     let mut buffer = vec![0; BUFFER];
     for receiver in receivers {
         let start = Instant::now();
-        'next: loop {
+        loop {
             assert!(
                 start.elapsed() < SOON,
                 "the receiver joins: {:?}",
@@ -148,26 +148,15 @@ async fn meet(sender: &mut dyn Carrier, publisher: u16, receivers: &mut [&mut Bo
             let _not_yet = sender.try_send(&Outgoing::new(&value(publisher, WARM_UP, 0)));
             let _change = (sender.follow(), receiver.follow());
             let wait = timeout(Duration::from_millis(50), receiver.recv(&mut buffer));
-            while let Ok(received) = &wait_once(wait).await {
+            if let Ok(Ok(received)) = wait.await {
                 let (from, _) = read(&buffer[..received.length]);
                 if from == PublisherId::UInt16(publisher)
                     && Some(received.from) != receiver.source()
                 {
-                    break 'next;
+                    break;
                 }
-                break;
             }
         }
-    }
-}
-
-async fn wait_once<F>(wait: F) -> Result<transport::Received, ()>
-where
-    F: Future<Output = Result<std::io::Result<transport::Received>, tokio::time::error::Elapsed>>,
-{
-    match wait.await {
-        Ok(Ok(received)) => Ok(received),
-        _ => Err(()),
     }
 }
 

@@ -224,17 +224,8 @@ const HOLD: &str = r#"@prefix css: <http://www.w3id.org/hsu-aut/css#> . @prefix 
     css:requiresCapability [ a cask:RequiredCapability , <urn:example:capability:release> ] .
 "#;
 
-#[test]
-fn a_process_that_is_added_as_rdf_runs_with_one_gripper_and_outlasts_a_kill() {
-    let Some(cell) = Cell::with(&[]) else { return };
-    fs::copy(
-        Path::new(EXAMPLES).join("capabilities.ttl"),
-        cell.folder().join("capabilities.ttl"),
-    )
-    .unwrap();
-    let store = cell.folder().join("store");
-    let store = ["--store", store.to_str().unwrap()];
-    let mes = start(&cell, "ua-mes", "mes.yaml", &[], &store);
+/// Starts a gripper that cannot grasp, and then the one of the examples.
+fn two_grippers(cell: &Cell) -> [Child; 2] {
     // This gripper has been there for longer, and cannot grasp but release.
     let other = [
         ("component: parallel-gripper", "component: another"),
@@ -245,17 +236,22 @@ fn a_process_that_is_added_as_rdf_runs_with_one_gripper_and_outlasts_a_kill() {
         ("namespace: 7", "namespace: 8"),
         ("capability:grasp", "capability:look"),
     ];
-    let _another = start(&cell, "ua-component", "parallel-gripper.yaml", &other, &[]);
+    let another = start(cell, "ua-component", "parallel-gripper.yaml", &other, &[]);
     let is_there = |name: &str| rows("components").iter().any(|row| row["name"] == name);
     eventually("another gripper is in the graph", SOON, || {
         is_there("another").then_some(())
     });
     let fast = [("400 ms", "50 ms")];
-    let _gripper = start(&cell, "ua-component", "parallel-gripper.yaml", &fast, &[]);
+    let gripper = start(cell, "ua-component", "parallel-gripper.yaml", &fast, &[]);
     eventually("the gripper is in the graph", SOON, || {
         is_there("parallel-gripper").then_some(())
     });
+    [another, gripper]
+}
 
+/// Adds the process with a parameter that no skill has, and replaces it with the right one. Checks
+/// its plan each time.
+fn add_wrong_and_right(cell: &Cell) {
     let wrong = HOLD.replace(
         "FORCE",
         "; ua:hasParameter [ cask:hasVariableName \"Nonsense\" ; ua:value 1 ]",
@@ -292,6 +288,21 @@ fn a_process_that_is_added_as_rdf_runs_with_one_gripper_and_outlasts_a_kill() {
         "urn:example:gripper",
         "the gripper that grasped"
     );
+}
+
+#[test]
+fn a_process_that_is_added_as_rdf_runs_with_one_gripper_and_outlasts_a_kill() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    fs::copy(
+        Path::new(EXAMPLES).join("capabilities.ttl"),
+        cell.folder().join("capabilities.ttl"),
+    )
+    .unwrap();
+    let store = cell.folder().join("store");
+    let store = ["--store", store.to_str().unwrap()];
+    let mes = start(&cell, "ua-mes", "mes.yaml", &[], &store);
+    let _grippers = two_grippers(&cell);
+    add_wrong_and_right(&cell);
 
     let update = cell.file("update.ru", "INSERT DATA { <urn:a> <urn:b> 1 }");
     let (updated, told) = space(&["source", "update", update.to_str().unwrap()]);

@@ -85,6 +85,37 @@ fn values_cross_a_broker_that_is_late_and_restarts_and_its_topics_are_those_of_t
         "{retained:?}"
     );
 
+    is_listed_and_echoed();
+
+    broker.signal(Signal::SIGKILL);
+    drop(broker);
+    eventually("the loss is reported", SOON, || {
+        let (code, _) = http_answer(METRICS_ROS2, "/readyz")?;
+        (code == 503).then_some(())
+    });
+    let _broker = cell.mosquitto();
+    let before = delivered();
+    eventually("values cross again", SOON, || {
+        (delivered() > before).then_some(())
+    });
+    eventually("the broker has the metadata again", SOON, || {
+        let topics = cell.retained("opcua/uadp/metadata/#");
+        topics
+            .contains(&"opcua/uadp/metadata/1/5/10".to_owned())
+            .then_some(())
+    });
+
+    // A program that ends in order leaves nothing but its status.
+    let mut ros1 = ros1;
+    assert!(ros1.end().success());
+    eventually("the discovery messages are cleared", SOON, || {
+        let topics = cell.retained("opcua/uadp/+/1/#");
+        (topics == ["opcua/uadp/status/1"]).then_some(())
+    });
+}
+
+/// Checks that the tools show the topic and its value.
+fn is_listed_and_echoed() {
     let listed = space(&[
         "list",
         "--topics",
@@ -112,32 +143,6 @@ fn values_cross_a_broker_that_is_late_and_restarts_and_its_topics_are_those_of_t
         BROKER,
     ]);
     assert!(echoed.contains("over MQTT"), "{echoed}");
-
-    broker.signal(Signal::SIGKILL);
-    drop(broker);
-    eventually("the loss is reported", SOON, || {
-        let (code, _) = http_answer(METRICS_ROS2, "/readyz")?;
-        (code == 503).then_some(())
-    });
-    let _broker = cell.mosquitto();
-    let before = delivered();
-    eventually("values cross again", SOON, || {
-        (delivered() > before).then_some(())
-    });
-    eventually("the broker has the metadata again", SOON, || {
-        let topics = cell.retained("opcua/uadp/metadata/#");
-        topics
-            .contains(&"opcua/uadp/metadata/1/5/10".to_owned())
-            .then_some(())
-    });
-
-    // A program that ends in order leaves nothing but its status.
-    let mut ros1 = ros1;
-    assert!(ros1.end().success());
-    eventually("the discovery messages are cleared", SOON, || {
-        let topics = cell.retained("opcua/uadp/+/1/#");
-        (topics == ["opcua/uadp/status/1"]).then_some(())
-    });
 }
 
 /// Returns the number of values that bridge-ros2 delivered.
@@ -201,6 +206,42 @@ impl Commanded<'_> {
             },
         );
     }
+
+    /// Checks that a command that the broker delivers after its time is dropped and counted.
+    fn copy_is_dropped(&mut self) {
+        let mut copy = Started::new("mosquitto_sub", Path::new("/usr/bin/mosquitto_sub"))
+            .args([
+                "-h",
+                "127.0.0.1",
+                "-t",
+                "opcua/uadp/data/0/2/30",
+                "-C",
+                "1",
+                "-F",
+                "%x",
+            ])
+            .start();
+        eventually("a command is copied", SOON, || {
+            self.arrives();
+            (!copy.runs()).then_some(())
+        });
+        let hex = copy.lines().remove(0);
+        let bytes = (0..hex.len()).step_by(2);
+        let bytes: Vec<u8> = bytes
+            .map(|at| u8::from_str_radix(&hex[at..at + 2], 16).unwrap())
+            .collect();
+        let copied = self.cell.folder().join("command");
+        std::fs::write(&copied, bytes).unwrap();
+        let before = late();
+        eventually("the late command is counted", SOON, || {
+            let sent = Command::new("mosquitto_pub")
+                .args(["-h", "127.0.0.1", "-t", "opcua/uadp/data/0/2/30"])
+                .args(["-f", copied.to_str().unwrap()])
+                .status();
+            assert!(sent.unwrap().success());
+            (late() > before).then_some(())
+        });
+    }
 }
 
 /// Returns the number of late messages that the bridge dropped.
@@ -237,40 +278,7 @@ fn a_command_is_never_delivered_late_by_a_broker() {
         value: 0.0,
     };
     commanded.arrives();
-
-    // A command that the broker delivers after its time is dropped and counted.
-    let mut copy = Started::new("mosquitto_sub", Path::new("/usr/bin/mosquitto_sub"))
-        .args([
-            "-h",
-            "127.0.0.1",
-            "-t",
-            "opcua/uadp/data/0/2/30",
-            "-C",
-            "1",
-            "-F",
-            "%x",
-        ])
-        .start();
-    eventually("a command is copied", SOON, || {
-        commanded.arrives();
-        (!copy.runs()).then_some(())
-    });
-    let hex = copy.lines().remove(0);
-    let bytes = (0..hex.len()).step_by(2);
-    let bytes: Vec<u8> = bytes
-        .map(|at| u8::from_str_radix(&hex[at..at + 2], 16).unwrap())
-        .collect();
-    let copied = cell.folder().join("command");
-    std::fs::write(&copied, bytes).unwrap();
-    let before = late();
-    eventually("the late command is counted", SOON, || {
-        let sent = Command::new("mosquitto_pub")
-            .args(["-h", "127.0.0.1", "-t", "opcua/uadp/data/0/2/30"])
-            .args(["-f", copied.to_str().unwrap()])
-            .status();
-        assert!(sent.unwrap().success());
-        (late() > before).then_some(())
-    });
+    commanded.copy_is_dropped();
 
     // The broker is stopped for a time in which its clients may stay.
     broker.signal(Signal::SIGSTOP);

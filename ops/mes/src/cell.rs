@@ -446,9 +446,10 @@ fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String, Value)>, S
         let wrong = |why: String| format!("{}: {why}", given.name);
         let json = in_unit(given, parameter).map_err(wrong)?;
         let value = parameter.shape.read_json(&json).map_err(wrong)?;
-        let numbers = match &value {
-            Value::Array(_, elements) => elements.iter().filter_map(Value::as_f64).collect(),
-            one => Vec::from_iter(one.as_f64()),
+        let numbers = if let Value::Array(_, elements) = &value {
+            elements.iter().filter_map(Value::as_f64).collect()
+        } else {
+            Vec::from_iter(value.as_f64())
         };
         if let Some((low, high)) = parameter.range
             && let Some(number) = numbers
@@ -484,10 +485,10 @@ fn in_unit(given: &Given, parameter: &FoundParameter) -> Result<serde_json::Valu
             .map(Into::into)
             .ok_or_else(|| format!("its unit is {to}, and {from} cannot be converted to it"))
     };
-    match &given.value {
-        serde_json::Value::Array(all) => all.iter().map(one).collect(),
-        value => one(value),
+    if let serde_json::Value::Array(all) = &given.value {
+        return all.iter().map(one).collect();
     }
+    one(&given.value)
 }
 
 struct OpenedSkills {
@@ -551,7 +552,6 @@ fn parameter_facts(parameter: &FoundParameter, is_output: bool) -> ParameterFact
         max: parameter.range.map(|range| range.1),
         unit: parameter.unit.clone(),
         node: NodeName::parse(&parameter.node),
-        ..ParameterFacts::default()
     }
 }
 

@@ -77,6 +77,24 @@ impl Settings {
     }
 }
 
+/// Keys of the document.
+const KEYS: [&str; 14] = [
+    "mes",
+    "application_uri",
+    "namespace",
+    "endpoint",
+    "security",
+    "lds",
+    "open",
+    "user",
+    "sparql",
+    "store",
+    "knowledge",
+    "nodesets",
+    "manifests",
+    "processes",
+];
+
 struct Reading<'a> {
     reader: Reader<'a>,
     folder: &'a Path,
@@ -84,22 +102,6 @@ struct Reading<'a> {
 
 impl Reading<'_> {
     fn settings(&mut self, root: &Node) -> Option<Settings> {
-        let keys = [
-            "mes",
-            "application_uri",
-            "namespace",
-            "endpoint",
-            "security",
-            "lds",
-            "open",
-            "user",
-            "sparql",
-            "store",
-            "knowledge",
-            "nodesets",
-            "manifests",
-            "processes",
-        ];
         let [
             name,
             uri,
@@ -115,7 +117,7 @@ impl Reading<'_> {
             nodesets,
             manifests,
             processes,
-        ] = self.reader.map(root, keys)?;
+        ] = self.reader.map(root, KEYS)?;
         let name = self
             .reader
             .needed(name, "mes", root.place)

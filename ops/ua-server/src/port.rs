@@ -149,18 +149,12 @@ impl ServerPort {
         };
         let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
         let mdns = matches!(&setup.announce, Some(to) if to.mdns.is_some());
-        let core = core(
-            (&setup.sks, &pubsub, &alarms),
-            (&certificates, mdns),
-            described,
-        );
+        let shown = (&setup.sks, &pubsub, &alarms);
+        let core = core(shown, (&certificates, mdns), described);
         let builder = endpoint::server(described, (&setup.url, port), &security);
-        let (door, listener, builder) = endpoint::door(
-            &setup.pki,
-            setup.trust_any_client,
-            endpoint::clients(described.limits),
-            (listener, builder),
-        )?;
+        let (trusts_any, limits) = (setup.trust_any_client, endpoint::clients(described.limits));
+        let built = (listener, builder);
+        let (door, listener, builder) = endpoint::door(&setup.pki, trusts_any, limits, built)?;
         let (server, handle) = builder
             .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
             .with_node_manager(core)

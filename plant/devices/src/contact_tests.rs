@@ -77,6 +77,78 @@ const CHANGER: [f64; 3] = [0.0, 0.0, 0.047];
 /// The required accuracy, m.
 const ACCURACY: f64 = 1e-4;
 
+/// A gripper to test, and its geometry.
+struct Gripper {
+    name: &'static str,
+    /// The distance from the plate to the contact point, m.
+    length: f64,
+    grip_type: GripType,
+    /// The height of the contact point above the origin of the part, m.
+    above: f64,
+    device: Box<dyn Device>,
+}
+
+impl Gripper {
+    /// Returns the distance between the contact point and where it should be on the part, m.
+    fn error(&self, plate: Frame, flange: [f64; 6], part: [f64; 6]) -> f64 {
+        // The geometry of the machine, not the grip point that the composite reads.
+        let tip = plate.then(&Frame::at([0.0, 0.0, self.length]));
+        let contact = Frame::of_pose(flange).then(&tip);
+        let expected = Frame::of_pose(part).then(&Frame::at([0.0, 0.0, self.above]));
+        contact.distance(&expected)
+    }
+}
+
+/// The simulated robot and its device.
+struct Arm {
+    simulator: ur::simulator::Simulator,
+    device: ur::Robot,
+}
+
+impl Arm {
+    /// Picks and places the part. Returns where the flange was at the grasp and at the release.
+    async fn pick_and_place(
+        &self,
+        gripper: &Gripper,
+        plate: Frame,
+        place: [f64; 6],
+    ) -> Vec<[f64; 6]> {
+        let (of_arm, of_gripper) = (Authority::new(), Authority::new());
+        let flanges = Arc::new(Mutex::new(Vec::new()));
+        let recording = |of: &str| {
+            Arc::new(Recording {
+                inner: run_of(of, gripper.device.as_ref(), &of_gripper),
+                grip: Some(GripPoint {
+                    offset: [0.0, 0.0, gripper.length, 0.0, 0.0, 0.0],
+                    grip_type: Some(gripper.grip_type),
+                    opening: Some((0.0, 0.085)),
+                }),
+                robot: self.simulator.clone(),
+                flanges: Arc::clone(&flanges),
+            })
+        };
+        let composite = PickAndPlace {
+            ptp: Arc::new(run_of("PtpMoveSkillType", &self.device, &of_arm)),
+            linear: Arc::new(run_of("LinearMoveSkillType", &self.device, &of_arm)),
+            grasp: recording("GraspSkillType"),
+            release: recording("ReleaseSkillType"),
+            plate,
+            within: Duration::from_secs(60),
+        };
+        let job = Job {
+            pick: PICK,
+            place,
+            approach: 0.05,
+            shape: Some(PART),
+        };
+        let teller = |_step: &'static str| {};
+        composite.run(&job, &teller).await.unwrap();
+        let flanges = flanges.lock().unwrap().clone();
+        assert_eq!(flanges.len(), 2);
+        flanges
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn grippers_of_two_lengths_touch_the_part_at_the_same_point() {
     let settings = ur::simulator::Settings {
@@ -87,11 +159,14 @@ async fn grippers_of_two_lengths_touch_the_part_at_the_same_point() {
     let served = ur::simulator::Serving::start(&robot, "127.0.0.1:0", "127.0.0.1:0")
         .await
         .unwrap();
-    let arm = ur::Robot::new(ur::Settings {
-        rtde: served.rtde().to_string(),
-        secondary: served.secondary().to_string(),
-        reach: ur::REACH,
-    });
+    let arm = Arm {
+        simulator: robot,
+        device: ur::Robot::new(ur::Settings {
+            rtde: served.rtde().to_string(),
+            secondary: served.secondary().to_string(),
+            reach: ur::REACH,
+        }),
+    };
     let fingers = robotiq::simulator::Simulator::new(robotiq::simulator::Settings {
         object: Some(0.04),
         time_scale: 20.0,
@@ -109,70 +184,35 @@ async fn grippers_of_two_lengths_touch_the_part_at_the_same_point() {
         .unwrap();
     let address = master.address().to_string();
     let timing = schmalz::Timing::default();
-    let grippers: [(&str, f64, GripType, f64, Box<dyn Device>); 2] = [
-        (
-            "Robotiq 2F-85",
-            0.2028,
-            GripType::Parallel,
-            0.0,
-            Box::new(robotiq::Gripper::new(modbus.line().clone(), robotiq::UNIT)),
-        ),
-        (
-            "Schmalz ECBPi",
-            0.1868,
-            GripType::Vacuum,
-            0.025,
-            Box::new(schmalz::Gripper::new(&address, "master1port1", timing)),
-        ),
+    let grippers = [
+        Gripper {
+            name: "Robotiq 2F-85",
+            length: 0.2028,
+            grip_type: GripType::Parallel,
+            above: 0.0,
+            device: Box::new(robotiq::Gripper::new(modbus.line().clone(), robotiq::UNIT)),
+        },
+        Gripper {
+            name: "Schmalz ECBPi",
+            length: 0.1868,
+            grip_type: GripType::Vacuum,
+            above: 0.025,
+            device: Box::new(schmalz::Gripper::new(&address, "master1port1", timing)),
+        },
     ];
     println!("| gripper | length | plate | place | error at pick | error at place |");
-    for (name, length, grip_type, above, device) in &grippers {
+    for gripper in &grippers {
+        let Gripper { name, length, .. } = gripper;
         for (plate_name, plate) in [
             ("flange", Frame::IDENTITY),
             ("tool changer", Frame::at(CHANGER)),
         ] {
             for (place_name, place) in PLACES {
-                let (of_arm, of_gripper) = (Authority::new(), Authority::new());
-                let flanges = Arc::new(Mutex::new(Vec::new()));
-                let recording = |of: &str| {
-                    Arc::new(Recording {
-                        inner: run_of(of, &**device, &of_gripper),
-                        grip: Some(GripPoint {
-                            offset: [0.0, 0.0, *length, 0.0, 0.0, 0.0],
-                            grip_type: Some(*grip_type),
-                            opening: Some((0.0, 0.085)),
-                        }),
-                        robot: robot.clone(),
-                        flanges: Arc::clone(&flanges),
-                    })
-                };
-                let composite = PickAndPlace {
-                    ptp: Arc::new(run_of("PtpMoveSkillType", &arm, &of_arm)),
-                    linear: Arc::new(run_of("LinearMoveSkillType", &arm, &of_arm)),
-                    grasp: recording("GraspSkillType"),
-                    release: recording("ReleaseSkillType"),
-                    plate,
-                    within: Duration::from_secs(60),
-                };
-                let job = Job {
-                    pick: PICK,
-                    place,
-                    approach: 0.05,
-                    shape: Some(PART),
-                };
-                let teller = |_step: &'static str| {};
-                composite.run(&job, &teller).await.unwrap();
-                // The geometry of the machine, not the grip point that the composite reads.
-                let tip = plate.then(&Frame::at([0.0, 0.0, *length]));
-                let contact = |flange: [f64; 6]| Frame::of_pose(flange).then(&tip);
-                let expected =
-                    |part: [f64; 6]| Frame::of_pose(part).then(&Frame::at([0.0, 0.0, *above]));
-                let flanges = flanges.lock().unwrap().clone();
-                assert_eq!(flanges.len(), 2);
+                let flanges = arm.pick_and_place(gripper, plate, place).await;
                 let errors: Vec<f64> = flanges
                     .iter()
                     .zip([PICK, place])
-                    .map(|(flange, part)| contact(*flange).distance(&expected(part)))
+                    .map(|(flange, part)| gripper.error(plate, *flange, part))
                     .collect();
                 println!(
                     "| {name} | {length} m | {plate_name} | {place_name} | {:.4} mm | {:.4} mm |",

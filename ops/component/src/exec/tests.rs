@@ -15,13 +15,11 @@ impl Scripts {
 
     /// Returns a driver that runs this shell script, and one that stops the machine.
     fn driver(&self, script: &str) -> std::sync::Arc<dyn Driver> {
-        let text = format!(
-            "component: x\napplication_uri: urn:x\nnamespace: 1\nskills:\n  - name: Grasp\n    type: GraspSkillType\n    driver:\n      \
-             exec:\n        command: [/bin/sh, run.sh]\n        stop: [/bin/sh, -c, 'echo stopped >> stopped']\n        halt_timeout: 300 ms\n"
-        );
+        let text = "component: x\napplication_uri: urn:x\nnamespace: 1\nskills:\n  - name: Grasp\n    type: GraspSkillType\n    driver:\n      \
+             exec:\n        command: [/bin/sh, run.sh]\n        stop: [/bin/sh, -c, 'echo stopped >> stopped']\n        halt_timeout: 300 ms\n";
         std::fs::write(self.0.join("run.sh"), script).unwrap();
-        let component = Component::from_yaml(&text, &self.0)
-            .unwrap_or_else(|findings| panic!("{}", findings.render("x", &text)));
+        let component = Component::from_yaml(text, &self.0)
+            .unwrap_or_else(|findings| panic!("{}", findings.render("x", text)));
         let component = with_programs(component);
         let DriverSetup::Given(driver) = component.skills[0].driver.clone() else {
             panic!("another driver");
