@@ -40,20 +40,20 @@ struct BridgeRos2 {
     keys: KeyArguments,
     #[command(flatten)]
     told: TellingArguments,
-    /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the mapping's only ROS 2
-    /// space
+    /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the
+    /// mapping's only ROS 2 space
     #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = domain_number)]
     domain: Vec<Option<u16>>,
-    /// The space of this domain's values, 2 to 232, or one for each domain as 40,41; without it the one the mapping
-    /// gives the domain, or the one of the domain's number
+    /// The space of this domain's values, 2 to 232, or one for each domain as 40,41; without it the
+    /// one the mapping gives the domain, or the one of the domain's number
     #[arg(long, value_name = "N", env = "UA_SPACE", value_delimiter = ',', value_parser = space_number)]
     space: Vec<Option<u16>>,
-    /// The network interface of the ROS 2 side, by name or address; without it what `ROS_AUTOMATIC_DISCOVERY_RANGE`
-    /// and `ROS_LOCALHOST_ONLY` say, else all
+    /// The network interface of the ROS 2 side, by name or address; without it what
+    /// `ROS_AUTOMATIC_DISCOVERY_RANGE` and `ROS_LOCALHOST_ONLY` say, else all
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_ROS_INTERFACE")]
     ros_interface: Option<String>,
-    /// A host to announce the bridge to by unicast, where multicast does not reach; may be repeated. Without it the
-    /// hosts in `ROS_STATIC_PEERS`, separated by `;`
+    /// A host to announce the bridge to by unicast, where multicast does not reach; may be
+    /// repeated. Without it the hosts in `ROS_STATIC_PEERS`, separated by `;`
     #[arg(long, value_name = "ADDRESS")]
     ros_peer: Vec<String>,
     /// The name of the bridge's node
@@ -65,11 +65,12 @@ struct BridgeRos2 {
     /// Take the time for what is stamped from /clock
     #[arg(long)]
     use_sim_time: bool,
-    /// How many bytes a Gid has in the node's list of readers and writers: 24 up to ROS 2 Humble, 16 from Iron on
+    /// How many bytes a Gid has in the node's list of readers and writers: 24 up to ROS 2 Humble,
+    /// 16 from Iron on
     #[arg(long, value_name = "16|24|auto", default_value = "auto", value_parser = gid_length)]
     gid: GidChoice,
-    /// Arguments as `ros2 run` has them: -r __node:=NAME, -r __ns:=/NAMESPACE, -p use_sim_time:=true, --enclave /NAME;
-    /// ends with `--`
+    /// Arguments as `ros2 run` has them: -r __node:=NAME, -r __ns:=/NAMESPACE, -p
+    /// use_sim_time:=true, --enclave /NAME; ends with `--`
     #[arg(
         long,
         value_name = "ROS_ARGS",

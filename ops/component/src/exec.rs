@@ -1,8 +1,8 @@
 //! A skill that a program of the user executes: one process for each run, one JSON object a line.
 //!
 //! The process is the only member of its process group. A program that does not obey is killed with
-//! its group. Then the state of its machine is unknown: the `stop` command runs, and the skill needs
-//! a Reset.
+//! its group. Then the state of its machine is unknown: the `stop` command runs, and the skill
+//! needs a Reset.
 
 use std::process::Stdio;
 use std::time::Duration;
@@ -42,7 +42,8 @@ struct Program {
 enum Ended {
     /// The program has reported the results, or why the work is not done.
     Told(Result<Results, String>),
-    /// The program has not obeyed, or has ended without a result: the state of the machine is unknown.
+    /// The program has not obeyed, or has ended without a result: the state of the machine is
+    /// unknown.
     Unknown(String),
 }
 
@@ -230,8 +231,8 @@ async fn send(input: &mut ChildStdin, message: &Json) -> Result<(), String> {
     }
 }
 
-/// Returns the next line without its end; `None` at the end of the output. Cancel safe: an incomplete
-/// line stays in `line`.
+/// Returns the next line without its end; `None` at the end of the output. Cancel safe: an
+/// incomplete line stays in `line`.
 async fn next_line(
     output: &mut (impl AsyncBufRead + Unpin),
     line: &mut Vec<u8>,

@@ -76,8 +76,8 @@ pub(crate) enum Verb {
     Keys(MakeKeys),
     /// Write the access rules of an MQTT broker for a mapping
     ///
-    /// Prints an `acl_file` of mosquitto: a user for each space, which may write the messages of its
-    /// space only, and a user for `ua-space`.
+    /// Prints an `acl_file` of mosquitto: a user for each space, which may write the messages of
+    /// its space only, and a user for `ua-space`.
     ///
     /// Exit codes: 0 done, 64 the mapping names no broker, 65 the mapping cannot be read, 74 the
     /// file cannot be read or the output cannot be written.
@@ -200,11 +200,11 @@ pub(crate) enum Verb {
     Trace(Trace),
     /// Serve the page of the cell in a browser, read-only and without a server
     ///
-    /// The page is at http://127.0.0.1:8090/ unless --metrics names another address. The mapping adds
-    /// names, units and ROS topics.
+    /// The page is at http://127.0.0.1:8090/ unless --metrics names another address. The mapping
+    /// adds names, units and ROS topics.
     ///
-    /// Exit codes: 0 done, 64 usage, 69 the address or an interface is not available, 78 the mapping
-    /// cannot run.
+    /// Exit codes: 0 done, 64 usage, 69 the address or an interface is not available, 78 the
+    /// mapping cannot run.
     Page(PageArguments),
     /// Query the knowledge of the plant: skills, components, runs
     ///
@@ -213,8 +213,8 @@ pub(crate) enum Verb {
     Ask(Ask),
     /// Change the sources of the knowledge of the plant while ua-mes runs
     ///
-    /// Adds, replaces and removes NodeSets, manifests of modules, Turtle and processes. Sources that
-    /// the YAML of ua-mes names are changed there; SIGHUP reads them again.
+    /// Adds, replaces and removes NodeSets, manifests of modules, Turtle and processes. Sources
+    /// that the YAML of ua-mes names are changed there; SIGHUP reads them again.
     ///
     /// Exit codes: 0 done, 64 usage, or an unknown source, 65 the source is wrong, 69 no answer in
     /// time, or the user may not change sources, 74 a file cannot be read or the output cannot be
@@ -400,8 +400,8 @@ pub(crate) struct Decode {
     /// The file, or - for stdin
     #[arg(value_name = "FILE")]
     pub(crate) file: String,
-    /// Only datagrams from or to this UDP port of a capture. Without it: port 4840, and every other datagram that
-    /// is a NetworkMessage without a fault
+    /// Only datagrams from or to this UDP port of a capture. Without it: port 4840, and every other
+    /// datagram that is a NetworkMessage without a fault
     #[arg(long, value_name = "PORT")]
     pub(crate) port: Option<u16>,
     /// Every line of hexadecimal text is a datagram
@@ -429,12 +429,13 @@ pub(crate) struct Encode {
 /// What a reader has to know besides the datagram.
 #[derive(Debug, Args)]
 pub(crate) struct Known {
-    /// Keys of secured messages: a JSON object or an array of objects with policy, securityTokenId, signingKey,
-    /// encryptingKey and keyNonce, and optionally publisherId and writerGroupId
+    /// Keys of secured messages: a JSON object or an array of objects with policy, securityTokenId,
+    /// signingKey, encryptingKey and keyNonce, and optionally publisherId and writerGroupId
     #[arg(long, value_name = "FILE")]
     pub(crate) keys: Option<PathBuf>,
-    /// Fields of RawData messages: a JSON array with builtInType, valueRank, arrayDimensions and maxStringLength of
-    /// each, or an array of objects with such a metaData and publisherId, writerGroupId or dataSetWriterId
+    /// Fields of RawData messages: a JSON array with builtInType, valueRank, arrayDimensions and
+    /// maxStringLength of each, or an array of objects with such a metaData and publisherId,
+    /// writerGroupId or dataSetWriterId
     #[arg(long, value_name = "FILE")]
     pub(crate) metadata: Option<PathBuf>,
     /// The layout of padded texts and arrays in RawData

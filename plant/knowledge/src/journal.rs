@@ -2,9 +2,9 @@
 //! acknowledged.
 //!
 //! An entry is a line with the length and the CRC-32 of its contents, and the contents: the records
-//! of one change, each a line with its operation, followed by statements as N-Triples. A program that is killed may leave an
-//! incomplete entry at the end, which was not acknowledged. The file is written anew when most of
-//! its contents are outdated.
+//! of one change, each a line with its operation, followed by statements as N-Triples. A program
+//! that is killed may leave an incomplete entry at the end, which was not acknowledged. The file is
+//! written anew when most of its contents are outdated.
 
 use std::collections::{BTreeMap, HashSet};
 use std::fs::{self, File, OpenOptions};

@@ -10,7 +10,8 @@ use crate::logging::LogFormat;
 /// Flags win over `UA_*` environment variables, which win over the mapping.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Arguments {
-    /// The mapping YAML of the cell. Without one, topics named in the space cross, whatever their type
+    /// The mapping YAML of the cell. Without one, topics named in the space cross, whatever their
+    /// type
     #[arg(value_name = "MAPPING", env = "UA_MAPPING")]
     pub mapping: Option<PathBuf>,
     /// Check the mapping, print every finding, and exit
@@ -32,10 +33,12 @@ pub struct Flags {
     /// The network interface of the PubSub group, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     pub interface: Option<String>,
-    /// The PubSub group, as opc.udp://239.192.0.40:4840, or an MQTT broker, as mqtt://broker.local:1883
+    /// The PubSub group, as opc.udp://239.192.0.40:4840, or an MQTT broker, as
+    /// mqtt://broker.local:1883
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub address: Option<String>,
-    /// Take the secured groups of this mapping YAML, its key `security`, in place of those of the own configuration
+    /// Take the secured groups of this mapping YAML, its key `security`, in place of those of the
+    /// own configuration
     #[arg(long, value_name = "MAPPING", env = "UA_SECURITY")]
     pub security: Option<PathBuf>,
     /// How log lines look
@@ -46,12 +49,12 @@ pub struct Flags {
         default_value = "text"
     )]
     pub log: LogFormat,
-    /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON, and whether the program can
-    /// do its work: /readyz
+    /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON, and
+    /// whether the program can do its work: /readyz
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     pub metrics: Option<SocketAddr>,
-    /// Where samples follow each other closely, look for the next one for so long before sleeping, as 200. Takes up to one
-    /// core while they do: only for a closed loop, with cores to spare
+    /// Where samples follow each other closely, look for the next one for so long before sleeping,
+    /// as 200. Takes up to one core while they do: only for a closed loop, with cores to spare
     #[arg(
         long,
         value_name = "MICROSECONDS",

@@ -49,8 +49,8 @@ pub type PageBody = UnsyncBoxBody<Bytes, Infallible>;
 /// Requests the status of each run loop, as `/status` has it.
 pub type Statuses = Arc<dyn Fn() -> BoxFuture<Vec<String>> + Send + Sync>;
 
-/// Pages that a program serves beside its status. The thread of the run loops serves them, so a page
-/// leaves longer work to a thread of its own.
+/// Pages that a program serves beside its status. The thread of the run loops serves them, so a
+/// page leaves longer work to a thread of its own.
 pub trait Site: Send + Sync + 'static {
     /// Receives the access to the status of the program, before the first request.
     fn start(&self, statuses: Statuses);

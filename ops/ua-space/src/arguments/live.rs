@@ -15,10 +15,12 @@ pub(crate) struct Group {
     /// The network interface of the PubSub group, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     pub(crate) interface: Option<String>,
-    /// The PubSub group, as opc.udp://239.192.0.40:4840, or an MQTT broker, as mqtt://broker.local:1883
+    /// The PubSub group, as opc.udp://239.192.0.40:4840, or an MQTT broker, as
+    /// mqtt://broker.local:1883
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub(crate) address: Option<String>,
-    /// A mapping with the settings of an MQTT broker (`pubsub`): its address, TLS, log-in and prefix
+    /// A mapping with the settings of an MQTT broker (`pubsub`): its address, TLS, log-in and
+    /// prefix
     #[arg(long, value_name = "MAPPING", env = "UA_BROKER")]
     pub(crate) broker: Option<PathBuf>,
     /// The keys of a secured group, in the format of `ua-space keys` and `decode`: messages are
@@ -182,7 +184,8 @@ pub(crate) struct WatchSkills {
 
 #[derive(Debug, Args)]
 pub(crate) struct ListSkills {
-    /// Only the skills of this component, as parallel-gripper, or only this skill, as parallel-gripper.Grasp
+    /// Only the skills of this component, as parallel-gripper, or only this skill, as
+    /// parallel-gripper.Grasp
     #[arg(value_name = "COMPONENT|SKILL")]
     pub(crate) what: Option<String>,
     /// Time to listen
@@ -209,14 +212,15 @@ pub(crate) struct Call {
     /// Time to wait for the response, which is sent to the executor as a deadline
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds)]
     pub(crate) timeout: f64,
-    /// Call Halt when the run of a skill takes longer, or cancel the goal of an action. Without it: at Ctrl-C
+    /// Call Halt when the run of a skill takes longer, or cancel the goal of an action. Without it:
+    /// at Ctrl-C
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) run_timeout: Option<f64>,
     /// End with the response; the run of a skill or the goal continues
     #[arg(long)]
     pub(crate) no_wait: bool,
-    /// Print a JSON object for the response and each step of the run, or each feedback and the result
-    /// of the goal
+    /// Print a JSON object for the response and each step of the run, or each feedback and the
+    /// result of the goal
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]

@@ -265,8 +265,8 @@ impl Router {
         }
     }
 
-    /// Carries out the consequences of a message for its topic: the end of a silence, and a probe for
-    /// a changed description.
+    /// Carries out the consequences of a message for its topic: the end of a silence, and a probe
+    /// for a changed description.
     fn follow_up(&mut self, topic: TopicId, (returned, changed): (bool, bool), now: Now) {
         if returned {
             self.tell_returned(topic);
