@@ -93,7 +93,7 @@ fn a_gripper_that_is_killed_in_the_middle_is_replaced_by_another_makers() {
         rows.count()
     };
     let there = ["robot", "parallel-gripper", "mes", "Stage:1.0.0"].map(of);
-    assert_eq!(there, [2, 2, 1, 6], "{can_run:?}");
+    assert_eq!(there, [2, 2, 2, 6], "{can_run:?}");
     let plan = get(&format!("/plan/{PROCESS}")).unwrap();
     assert_eq!(plan["complete"], true, "{plan}");
 

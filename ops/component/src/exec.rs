@@ -120,11 +120,10 @@ impl Program {
             .collect();
         let start =
             json!({"start": {"skill": self.skill, "run": work.run(), "parameters": parameters}});
-        if let Err(why) = send(&mut input, &start).await {
-            return unknown(&why);
-        }
+        // A program that reads nothing may have written its result and ended.
+        let deaf = send(&mut input, &start).await.err();
+        let mut until = deaf.as_ref().map(|_| Instant::now() + SENT_WITHIN);
         work.step("Run").await;
-        let mut until: Option<Instant> = None;
         tokio::pin!(logging);
         let mut line = Vec::new();
         loop {
@@ -159,6 +158,9 @@ impl Program {
                     }
                 }
                 () = at(until) => {
+                    if let Some(why) = &deaf {
+                        return unknown(why);
+                    }
                     let limit = self.work.halt_timeout;
                     return unknown(&format!("it has not halted within {limit:?} and was killed"));
                 }

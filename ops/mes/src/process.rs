@@ -157,6 +157,9 @@ impl Process {
                 say(&self.iri, predicate, Object::Text(numbers.join(" ")));
             }
             say(&self.iri, v::APPROACH, Object::Number(job.approach));
+            if let Some(shape) = &job.shape {
+                say(&self.iri, v::SHAPE, Object::Text(shape.to_string()));
+            }
         }
         let iris = self.step_iris();
         for ((step, position), step_iri) in self.steps.iter().zip(1_i64..).zip(&iris) {

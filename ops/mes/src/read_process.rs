@@ -130,8 +130,19 @@ fn job(rows: &[&Row]) -> Result<Option<skills::Job>, String> {
         pick,
         place,
         approach: approach.unwrap_or(USUALLY_APPROACH),
-        shape: None,
+        shape: shape(rows)?,
     }))
+}
+
+fn shape(rows: &[&Row]) -> Result<Option<skills::PartShape>, String> {
+    let Some(value) = one(rows, "shape")? else {
+        return Ok(None);
+    };
+    let text = value.as_str().unwrap_or_default();
+    let shape = text.parse();
+    shape
+        .map(Some)
+        .map_err(|why| format!("its ua:shape `{text}` {why}"))
 }
 
 fn step(
@@ -363,6 +374,9 @@ mod tests {
     fn processes_of_the_yaml_come_back_from_the_graph_as_they_were() {
         let example = include_str!("../../../examples/plant/mes.yaml");
         let own = "  - process: urn:p\n    wait: 4 s\n    steps:\n      - {step: grip, needs: {skill: urn:c:grasp}, parameters: {Force: {value: 12.5, unit: N}, Name: a, All: [1, true], Deep: -3}}\n      - {step: hold, needs: {skill: {type: GraspSkillType}}, by: attached-tool}\n      - {step: hold, needs: {skill: {type: 'nsu=urn:maker;HoldType', capability: urn:c:hold}}, by: {component_of: grip}}\n";
+        let shaped = "approach: 0.05, shape: {box: [0.04, 0.06, 0.05]}";
+        assert!(example.contains("approach: 0.05"), "{example}");
+        let example = example.replacen("approach: 0.05", shaped, 1);
         let text = format!("{example}{own}");
         let settings = Settings::from_yaml(&text, Path::new(""))
             .unwrap_or_else(|findings| panic!("{}", findings.render("mes.yaml", &text)));

@@ -1,6 +1,7 @@
 //! Grip points: where and how a gripper holds a part.
 
 use std::fmt;
+use std::str::FromStr;
 
 use crate::frame::Frame;
 
@@ -81,6 +82,44 @@ pub enum PartShape {
     },
     /// A sphere with this diameter, m.
     Sphere(f64),
+}
+
+/// A text that is not the shape of a part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("is no shape: `box X Y Z`, `cylinder DIAMETER HEIGHT` or `sphere DIAMETER`, above 0 m")]
+pub struct NoShape;
+
+impl fmt::Display for PartShape {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Box([x, y, z]) => write!(f, "box {x} {y} {z}"),
+            Self::Cylinder { diameter, height } => write!(f, "cylinder {diameter} {height}"),
+            Self::Sphere(diameter) => write!(f, "sphere {diameter}"),
+        }
+    }
+}
+
+impl FromStr for PartShape {
+    type Err = NoShape;
+
+    fn from_str(text: &str) -> Result<Self, NoShape> {
+        let mut words = text.split_ascii_whitespace();
+        let kind = words.next().ok_or(NoShape)?;
+        let lengths = words.map(|word| word.parse().map_err(|_| NoShape));
+        let lengths: Vec<f64> = lengths.collect::<Result<_, _>>()?;
+        if !lengths
+            .iter()
+            .all(|length| length.is_finite() && *length > 0.0)
+        {
+            return Err(NoShape);
+        }
+        match (kind, &lengths[..]) {
+            ("box", &[x, y, z]) => Ok(Self::Box([x, y, z])),
+            ("cylinder", &[diameter, height]) => Ok(Self::Cylinder { diameter, height }),
+            ("sphere", &[diameter]) => Ok(Self::Sphere(diameter)),
+            _ => Err(NoShape),
+        }
+    }
 }
 
 impl GripPoint {

@@ -39,7 +39,7 @@ pub use component::{
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};
-pub use grip::{GripPoint, GripType, PartShape};
+pub use grip::{GripPoint, GripType, NoShape, PartShape};
 pub use model::NAMESPACE;
 pub use parameters::{NoTypeName, Parameter, Parameters, TypeName};
 pub use part::{PartEnd, run_part};

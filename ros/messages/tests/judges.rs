@@ -374,7 +374,7 @@ fn every_action_of_the_bundle_is_the_same_calls_and_values_in_both_ros() {
         assert_eq!(one, two, "{action}");
         judged += 1;
     }
-    assert_eq!(judged, 30);
+    assert_eq!(judged, 31);
 }
 
 #[test]

@@ -151,12 +151,8 @@ fn deep_values_are_findings() {
         )
     };
     assert!(read(&deep(10)).is_ok());
-    let told = read(&deep(50)).unwrap_err();
-    assert!(
-        told.starts_with("a.xml:3: node ns=1;i=7: the value cannot be read: "),
-        "{told}"
-    );
-    for times in [3_000, 100_000] {
+    assert!(read(&deep(25)).is_ok());
+    for times in [50, 3_000, 100_000] {
         let told = read(&deep(times)).unwrap_err();
         assert!(
             told.contains("node ns=1;i=7: Elements are nested deeper"),

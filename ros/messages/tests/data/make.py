@@ -11,7 +11,7 @@
     python3 make.py hashes    needs rosbags -> ros2_type_hashes.txt
     python3 make.py idl       needs rosbags -> rosbags_idl.json
 
-The files of ua_msgs of this project (../../../ros/ua_msgs) are added to each store of rosbags.
+The files of ua_msgs of this project (../../../ua_msgs) are added to each store of rosbags.
 
 ros1_md5.txt          name and MD5 of each ROS 1 type: rosbags' store ROS1_NOETIC
 ros1_services.txt     name and MD5 of each service of these packages, of roscpp/Logger, and of the
@@ -42,7 +42,7 @@ PACKAGES_2 = PACKAGES_1 + """builtin_interfaces action_msgs unique_identifier_ms
 
 
 def ours():
-    files = pathlib.Path(__file__).resolve().parents[3].glob("ros/ua_msgs/msg/*.msg")
+    files = pathlib.Path(__file__).resolve().parents[3].glob("ua_msgs/msg/*.msg")
     return [(f"ua_msgs/{path.stem}", path.read_text()) for path in sorted(files)]
 
 
@@ -162,7 +162,7 @@ def actions():
         script = pathlib.Path(__file__).resolve().parent / "genmsg_md5.py"
         made = subprocess.run([sys.executable, script, root], capture_output=True, text=True, check=True)
         table += made.stdout.splitlines()
-    ua_msgs = script.parents[3] / "ros/ua_msgs"
+    ua_msgs = script.parents[3] / "ua_msgs"
     made = subprocess.run([sys.executable, script, ua_msgs], capture_output=True, text=True, check=True)
     table += made.stdout.splitlines()
     with open("ros1_actions.txt", "w") as out:
