@@ -305,7 +305,7 @@ async fn a_value_that_waits_for_room_when_its_topic_is_given_up_is_counted() {
     run_until(&mut port, "it hears", || last_is(&reader, "before")).await;
     reader.signal(Signal::SIGSTOP);
     // Without room, a new value replaces a waiting value.
-    let refused = (0..1000).find_map(|number| {
+    let refused = (0..10_000).find_map(|number| {
         let refused = port.publish(delivery(of, &number.to_string()));
         refused.err()
     });
