@@ -75,11 +75,6 @@ impl Machine {
             let folder = format!("{sysroot}/{folder}/{}-linux-gnu/", self.rpm);
             flags.push(format!("-Clink-arg=-B{folder}"));
         }
-        // The linker folds functions with equal code, which generics produce in numbers. Rust links
-        // with LLD on this machine only.
-        if self.rpm == "x86_64" {
-            flags.push("-Clink-arg=-Wl,--icf=all".to_owned());
-        }
         build
             .args(["--target", self.triple])
             .env(format!("{prefix}_LINKER"), "gcc")
