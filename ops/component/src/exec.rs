@@ -1,7 +1,8 @@
-//! A skill that a program of the user executes: one process for each run, one JSON object a line.
+//! A skill that a program of the user executes: a process for each run, and a JSON object in each
+//! line.
 //!
-//! The process is the only member of its process group. A program that does not obey is killed with
-//! its group. Then the state of its machine is unknown: the `stop` command runs, and the skill
+//! The process leads a process group of its own. A program that does not obey is killed with its
+//! group. Then the state of its machine is unknown: the `stop` command runs, and the skill
 //! needs a Reset.
 
 use std::process::Stdio;
