@@ -88,7 +88,7 @@ def page_of(demo):
     """Returns the address of the page and the folder of the logs, which the demo prints."""
     for line in demo.stdout:
         print(line, end="")
-        found = re.search(r"page of the cell (?:is )?at (http://\S+/), the logs (?:are )?in (\S+)\\.", line)
+        found = re.search(r"page of the cell (?:is )?at (http://\S+/), the logs (?:are )?in (\S+)\.", line)
         if found:
             return found.groups()
     raise SystemExit("the demo has not printed the address of its page")
@@ -186,8 +186,8 @@ def operate(judge, binaries, folder, examples):
     log = (folder / "operate.log").open("w")
     running = [subprocess.Popen(command, stdout=log, stderr=log) for command in commands]
     try:
-        time.sleep(2)
         url = f"http://{address}/"
+        judge.wait("the page is served", lambda: served(judge, url))
         judge.look("dark", WIDE)
         judge.open(url, "skills")
         judge.wait("the skill is there", lambda: "Grasp" in judge.text())

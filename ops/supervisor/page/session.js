@@ -10,6 +10,7 @@ export const session = {
   mayOperate: false,
   maySignIn: false,
   mustSignIn: false,
+  pending: new Set(),
 
   /** Reads the session. */
   async load() {
@@ -32,16 +33,29 @@ export const session = {
     say(sign, this.user ? "Sign out" : "Sign in");
   },
 
-  /** Sends a request that changes something. Returns the response, or throws the reason. */
+  /**
+   * Sends a request that changes something. Returns the response, or throws the reason. A request
+   * is not sent again before its response has come.
+   */
   async post(path, body) {
-    const response = await fetch(path, {
-      method: "POST",
-      headers: { "content-type": "application/json", "x-csrf-token": this.csrf },
-      body: JSON.stringify(body),
-    });
-    const answer = await response.json().catch(() => ({}));
-    if (!response.ok) throw new Error(answer.error ?? `the response is ${response.status}`);
-    return answer;
+    const text = JSON.stringify(body);
+    const sent = `${path} ${text}`;
+    if (this.pending.has(sent)) throw new Error("already sent: its outcome is awaited");
+    this.pending.add(sent);
+    try {
+      const response = await fetch(path, {
+        method: "POST",
+        headers: { "content-type": "application/json", "x-csrf-token": this.csrf },
+        body: text,
+      }).catch(() => {
+        throw new Error("the connection is lost: the outcome is unknown");
+      });
+      const answer = await response.json().catch(() => ({}));
+      if (!response.ok) throw new Error(answer.error ?? `the response is ${response.status}`);
+      return answer;
+    } finally {
+      this.pending.delete(sent);
+    }
   },
 };
 

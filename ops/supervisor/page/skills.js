@@ -170,7 +170,8 @@ function ask(name, verb, call, session) {
       dialog.close();
       answered(name, answer);
     } catch (error) {
-      say(fault, error.message);
+      if (dialog.open) say(fault, error.message);
+      else tell(name, "fault", [error.message]);
     }
   });
   dialog.addEventListener("close", () => dialog.remove());

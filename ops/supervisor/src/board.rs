@@ -159,6 +159,16 @@ impl Board {
         }
     }
 
+    /// Takes a description that was received in clear. In a secured namespace it is ignored,
+    /// because any host can send it.
+    pub(crate) fn announce(&mut self, topic: TopicId, description: Description) {
+        let (_, namespace, _) = topic.triple();
+        let mapping = self.mapping.as_deref();
+        if mapping.is_none_or(|mapping| mapping.group_of(namespace).is_none()) {
+            self.describe(topic, description);
+        }
+    }
+
     /// Takes the description of a topic.
     pub(crate) fn describe(&mut self, topic: TopicId, description: Description) {
         let Some(entry) = self.entry(topic) else {

@@ -55,10 +55,14 @@ fn variant(field: &CallField, value: &Value, block: &mut Vec<u8>) -> Result<(), 
         None => {
             let all = text(value);
             let all = all.trim().trim_start_matches('[').trim_end_matches(']');
-            let each = all
-                .split([',', ';'])
-                .map(|element| element.trim().to_owned());
-            each.filter(|element| !element.is_empty()).collect()
+            let separator = if all.contains(';') { ';' } else { ',' };
+            match all.trim() {
+                "" => Vec::new(),
+                all => all
+                    .split(separator)
+                    .map(|element| element.trim().to_owned())
+                    .collect(),
+            }
         }
     };
     let length = i32::try_from(elements.len()).map_err(|_| "too many elements".to_owned())?;
@@ -196,6 +200,13 @@ mod tests {
             rank: Rank::Array { fixed: Some(6) },
             ..CallField::array("Joints", BuiltinType::Double)
         };
+        for text in ["1,,3", "0,5; 1,5"] {
+            let joints = vec![CallField::array("Joints", BuiltinType::Double)];
+            assert!(
+                encoded(joints, &json!({ "Joints": text })).is_err(),
+                "{text}"
+            );
+        }
         let fault = encoded(vec![fixed], &json!({ "Joints": [1, 2] })).unwrap_err();
         assert_eq!(fault, "`Joints`: 6 elements are wanted, not 2");
     }

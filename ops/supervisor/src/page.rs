@@ -161,7 +161,7 @@ impl Observer for Page {
 
     fn datagram(&self, datagram: &[u8], from: SocketAddr) {
         if let Some((topic, description)) = announced::read(datagram, from) {
-            self.board().describe(topic, description);
+            self.board().announce(topic, description);
         }
     }
 

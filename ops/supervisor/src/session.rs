@@ -85,6 +85,12 @@ impl Sessions {
         Some(session.clone())
     }
 
+    /// Returns the user of a session, without prolonging the session.
+    pub(crate) fn user(&mut self, token: &str, now: Duration) -> Option<String> {
+        self.expire(now);
+        self.open.get(token).map(|session| session.user.clone())
+    }
+
     /// Closes a session.
     pub(crate) fn close(&mut self, token: &str) {
         self.open.remove(token);

@@ -135,7 +135,7 @@ impl Page {
                     Refusal::new(StatusCode::SERVICE_UNAVAILABLE, why)
                 })?;
                 visit.keep_open();
-                let events = Events::start(worker, Arc::clone(&self), view);
+                let events = Events::start(worker, Arc::clone(&self), view, browser.token);
                 Ok(with_headers("text/event-stream", events.boxed_unsync()))
             }
             _ => Err(Refusal::new(
@@ -257,6 +257,7 @@ impl Page {
         }
         let request = encode::request(&call, &fields).map_err(bad_request)?;
         let user = session.user.clone();
+        info!(user, %topic, call = call.name, "call requested on the page");
         let answered = operations.call(user.clone(), topic, request.into()).await;
         let outcome = outcome(answered.as_ref().err());
         info!(user, %topic, call = call.name, outcome, "called from the page");
@@ -271,7 +272,10 @@ impl Page {
         &self,
         operations: &Arc<dyn Operations>,
         session: &Session,
-        Write { topic, value }: Write,
+        Write {
+            topic,
+            value: given,
+        }: Write,
     ) -> Result<Response<PageBody>, Refusal> {
         let topic = parse_topic(&topic)?;
         let writable = {
@@ -284,11 +288,13 @@ impl Page {
             Refusal::new(StatusCode::CONFLICT, why)
         })?;
         let (node, field) = &*writable;
-        let block = encode::value(field, &value).map_err(bad_request)?;
+        let block = encode::value(field, &given).map_err(bad_request)?;
         let user = session.user.clone();
+        let value = value::cut(&given.to_string(), 200);
+        info!(user, %topic, value, "write requested on the page");
         let written = operations.write(user.clone(), node, block.into()).await;
         let outcome = outcome(written.as_ref().err());
-        info!(user, %topic, %value, outcome, "written from the page");
+        info!(user, %topic, value, outcome, "written from the page");
         written.map_err(|fault| refusal(fault, &user))?;
         Ok(json_page(&json!({ "outcome": outcome })))
     }
@@ -362,6 +368,18 @@ impl Page {
             session,
             token,
         }
+    }
+
+    /// Returns whether the browser of a session may still read.
+    pub(crate) fn may_read(&self, token: &str) -> bool {
+        if self.proxy.is_none() {
+            return true;
+        }
+        let now = self.at().since;
+        let user = self.sessions().user(token, now);
+        let operations = self.operations.get();
+        user.zip(operations)
+            .is_some_and(|(user, operations)| operations.roles(&user).is_some())
     }
 
     /// Checks that a browser may read: on loopback without a proxy every browser may. Behind a

@@ -15,8 +15,8 @@ use tokio::time::{MissedTickBehavior, interval};
 use crate::page::Page;
 use crate::view::{View, Viewer};
 
-/// The thread that makes events and reads the status of programs, so that browsers do not delay
-/// samples. It ends when this value is dropped.
+/// The thread that makes events and reads the status of programs, so that browsers delay
+/// samples only while an event is made. It ends when this value is dropped.
 #[derive(Debug)]
 pub(crate) struct Worker {
     handle: Handle,
@@ -58,22 +58,22 @@ pub(crate) struct Events(mpsc::Receiver<Bytes>);
 
 impl Events {
     /// Starts the stream of a view.
-    pub(crate) fn start(worker: &Worker, page: Arc<Page>, view: View) -> Self {
+    pub(crate) fn start(worker: &Worker, page: Arc<Page>, view: View, token: String) -> Self {
         let (events, taken) = mpsc::channel(1);
-        worker.spawn(make(page, view, events));
+        worker.spawn(make(page, view, token, events));
         Self(taken)
     }
 }
 
-/// Makes events until the browser has left.
-async fn make(page: Arc<Page>, view: View, events: mpsc::Sender<Bytes>) {
+/// Makes events until the browser has left, or its session has ended.
+async fn make(page: Arc<Page>, view: View, token: String, events: mpsc::Sender<Bytes>) {
     let mut ticks = interval(view.period());
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut viewer = Viewer::new(view);
     page.came();
     let retry = Bytes::from_static(b"retry: 2000\n\n");
     let mut is_there = events.send(retry).await.is_ok();
-    while is_there {
+    while is_there && page.may_read(&token) {
         ticks.tick().await;
         is_there = match events.reserve().await {
             Ok(free) => {

@@ -119,18 +119,36 @@ impl Operations for PageOperations {
                 .inner()
                 .write_one(manager.address_space(), &writer, &write)
                 .await;
-            written.map(drop).map_err(write_fault)
+            match written {
+                Ok(StatusCode::GoodCompletesAsynchronously) => {
+                    Err(OperationFault::Unknown(WHEN_CONNECTED.to_owned()))
+                }
+                Ok(_) => Ok(()),
+                Err(status) => Err(write_fault(status)),
+            }
         })
     }
 }
 
-/// Returns the fault of a refused write.
+/// The reason of an outcome that is not known yet.
+const WHEN_CONNECTED: &str =
+    "the server of this variable is not connected: it gets the value when it returns";
+
+/// Returns the fault of a write without success.
 fn write_fault(status: StatusCode) -> OperationFault {
     if status == StatusCode::BadUserAccessDenied {
         return OperationFault::Denied;
     }
     let text = status.to_string();
-    if status == StatusCode::BadTimeout {
+    // The value may have been sent before.
+    let is_unknown = matches!(
+        status,
+        StatusCode::BadTimeout
+            | StatusCode::BadNoCommunication
+            | StatusCode::BadRequestCancelledByRequest
+            | StatusCode::BadShutdown
+    );
+    if is_unknown {
         return OperationFault::Unknown(text);
     }
     OperationFault::Refused(text)
@@ -139,6 +157,9 @@ fn write_fault(status: StatusCode) -> OperationFault {
 fn fault(refused: Refused) -> OperationFault {
     match refused {
         Refused::Arguments(_) => OperationFault::Refused("arguments of the wrong type".to_owned()),
+        Refused::Status(status @ StatusCode::BadShutdown) => {
+            OperationFault::Unknown(status.to_string())
+        }
         Refused::Status(status) => OperationFault::Refused(status.to_string()),
         Refused::Asked(error) => match error.kind {
             AskErrorKind::Refused => OperationFault::Refused(error.text),
