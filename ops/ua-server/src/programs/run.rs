@@ -165,12 +165,21 @@ impl Run {
         }
         // If the server is killed during the goal, its outcome is unknown to the next one.
         self.unknown.begin(self.goal).await;
-        let mut goal = vec![Variant::from(id.clone())];
-        goal.extend(arguments);
-        let answer = self.send.call(&goal, &questions, || false).await;
-        let accepted = match answer {
-            Ok(answer) => self.is_accepted(&answer),
-            Err(refused) => Err((in_terms_of_start(refused), None)),
+        // The goal is stored first; a Halt meanwhile must not be overtaken by it.
+        let is_withdrawn = {
+            let inner = self.inner.lock();
+            inner.left || inner.halting.is_some()
+        };
+        let accepted = if is_withdrawn {
+            let refused = Refused::Status(StatusCode::BadRequestCancelledByRequest);
+            Err((refused, Some("halted before the goal was sent".to_owned())))
+        } else {
+            let mut goal = vec![Variant::from(id.clone())];
+            goal.extend(arguments);
+            match self.send.call(&goal, &questions, || false).await {
+                Ok(answer) => self.is_accepted(&answer),
+                Err(refused) => Err((in_terms_of_start(refused), None)),
+            }
         };
         let mut inner = self.inner.lock();
         inner.starting = false;
