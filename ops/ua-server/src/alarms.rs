@@ -255,7 +255,7 @@ impl Inner {
         let levels = match reading.as_ref().filter(|_| !quality.is_bad()) {
             Some(reading) => trigger.read(reading, now),
             // A missing value says nothing about the machine.
-            None => entry.condition.state().levels,
+            None => trigger.levels(),
         };
         match trigger.due() {
             Some(due) => drop(self.delays.insert(node.clone(), due)),
@@ -354,8 +354,16 @@ impl Alarms {
                 let topic = variable.topic;
                 if alarm.trigger == AlarmTrigger::Diagnostics {
                     let origin = diagnostics::Origin::of(variable, alarm);
+                    let is_public = place.space.inner().is_public(&node_id(&variable.node));
                     let all = old.extract_if(|_, entry| origin.has(&entry.identity));
-                    inner.conditions.extend(all);
+                    for (node, mut entry) in all {
+                        if entry.is_public != is_public {
+                            // The next status makes the text again.
+                            inner.diagnostics.retain(|other| *other != node);
+                        }
+                        entry.is_public = is_public;
+                        inner.conditions.insert(node, entry);
+                    }
                     inner.sources.insert(topic, Source::Diagnostics(origin));
                     continue;
                 }
@@ -372,6 +380,8 @@ impl Alarms {
                 inner.sources.insert(topic, Source::Value(node.clone()));
                 inner.conditions.insert(node, entry);
             }
+            let kept = &inner.conditions;
+            inner.diagnostics.retain(|node| kept.contains_key(node));
             inner.reports.follow(mapping, now().monotonic);
             let spaces = publishers::spaces(mapping);
             for entry in inner.publishers.follow(spaces) {

@@ -227,7 +227,9 @@ impl Space {
 
     /// Shows if the last written value of a topic has arrived at the bridges.
     pub(crate) fn show_arrival(&self, topic: TopicId, has_arrived: bool) {
-        if let Some(known) = self.topics.get(&topic) {
+        let known = self.topics.get(&topic);
+        // The status of a value of another server is the status of that server.
+        if let Some(known) = known.filter(|known| !known.node.sourced) {
             let nodes = self.manager.inner();
             nodes.show_arrival(&self.subscriptions, &known.node, has_arrived);
         }

@@ -54,8 +54,10 @@ impl Origin {
             "" => (*name, (*name).to_owned()),
             hardware => (hardware, format!("{hardware}: {name}")),
         };
+        // The first slash ends the hardware id.
+        let part = hardware.replace('%', "%25").replace('/', "%2F");
         Identity {
-            node: NodeId::new(1, format!("{}.alarm/{hardware}/{name}", self.topic)),
+            node: NodeId::new(1, format!("{}.alarm/{part}/{name}", self.topic)),
             kind: Kind::SystemDiagnostic,
             source: self.node.clone(),
             source_name: source_name.to_owned(),
@@ -75,6 +77,13 @@ pub(super) struct Diagnostics {
     last: HashMap<NodeId, (u8, String)>,
     /// Number of statuses without a condition.
     refused: u64,
+}
+
+impl Diagnostics {
+    /// Forgets the statuses whose condition is not kept.
+    pub(super) fn retain(&mut self, is_kept: impl Fn(&NodeId) -> bool) {
+        self.last.retain(|node, _| is_kept(node));
+    }
 }
 
 /// A `diagnostic_msgs/DiagnosticStatus`.
@@ -149,7 +158,7 @@ impl Inner {
         if !quality.is_good() {
             self.qualify(origin, quality, place);
         }
-        for element in array.iter() {
+        for element in array.iter().take(MOST_STATUSES) {
             let Scalar::ExtensionObject(object) = element else {
                 continue;
             };
@@ -169,7 +178,11 @@ impl Inner {
             if !self.conditions.contains_key(&node) {
                 if self.diagnostics.last.len() >= MOST_STATUSES {
                     match self.oldest_done() {
-                        Some(entry) => gone.push(entry.identity),
+                        Some(entry) => {
+                            // A status of the same array may give way.
+                            new.retain(|one: &Arc<Identity>| one.node != entry.identity.node);
+                            gone.push(entry.identity);
+                        }
                         None => {
                             self.refuse("1000 other statuses need attention");
                             continue;
@@ -245,13 +258,20 @@ impl Inner {
     }
 }
 
+/// Returns the beginning of a text, at most [`LONGEST_TEXT`] bytes.
+fn begin_of(text: &str) -> &str {
+    let mut ends = (0..=LONGEST_TEXT.min(text.len())).rev();
+    let end = ends.find(|end| text.is_char_boundary(*end));
+    text.get(..end.unwrap_or_default()).unwrap_or_default()
+}
+
 /// Decodes a DiagnosticStatus (OPC 10000-6, 5.2.6). Returns `None` for a malformed status.
 fn decode(body: &[u8]) -> Option<Status<'_>> {
     let mut rest = body;
     let (level, after) = rest.split_first()?;
     rest = after;
     let name = text(&mut rest)?;
-    let message = text(&mut rest)?;
+    let message = begin_of(text(&mut rest)?);
     let hardware = text(&mut rest)?;
     let count = length(&mut rest)?;
     let mut values = Vec::new();

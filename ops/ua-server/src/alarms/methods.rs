@@ -136,7 +136,7 @@ fn arguments(arguments: &[Variant]) -> Option<(ByteString, LocalizedText)> {
 
 fn action(request: &MethodRequest) -> Result<(ByteString, Action), StatusCode> {
     let (event, comment) = arguments(&request.arguments).ok_or(StatusCode::BadInvalidArgument)?;
-    if comment.text.as_ref().len() > LONGEST_COMMENT {
+    if comment.text.as_ref().len() + comment.locale.as_ref().len() > LONGEST_COMMENT {
         return Err(StatusCode::BadOutOfRange);
     }
     let user = request.caller.user.clone();

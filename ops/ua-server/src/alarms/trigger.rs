@@ -100,6 +100,11 @@ impl Trigger {
         }
     }
 
+    /// Returns the levels of the last value that was compared.
+    pub(crate) const fn levels(&self) -> Levels {
+        self.levels
+    }
+
     /// Returns the levels of a value. A value that cannot be compared changes nothing.
     pub(crate) fn read(&mut self, reading: &Reading, now: Instant) -> Levels {
         let Some(found) = evaluate(&self.rule, reading, self.levels) else {
