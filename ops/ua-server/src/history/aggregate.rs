@@ -253,9 +253,12 @@ fn average_over_time(samples: &[Sample], (from, to): (i64, i64), rules: Rules) -
         samples.get(at).and_then(|sample| sample.value)
     };
     let usable = |sample: &&Sample| rules.takes(sample.quality) && sample.value.is_some();
-    let inner = samples
-        .iter()
-        .filter(|one| one.time > from && one.time < to);
+    let inside = |(after, before): (i64, i64)| {
+        let first = samples.partition_point(|one| one.time <= after);
+        let last = samples.partition_point(|one| one.time < before);
+        samples.get(first..last).unwrap_or_default()
+    };
+    let inner = inside((from, to)).iter();
     let mut points = vec![(from, value_at(from))];
     points.extend(inner.filter(usable).map(|one| (one.time, one.value)));
     points.push((to, value_at(to)));
@@ -268,10 +271,10 @@ fn average_over_time(samples: &[Sample], (from, to): (i64, i64), rules: Rules) -
             continue;
         };
         area += (low + high) / 2.0 * time;
-        let skipped =
-            |one: &Sample| one.time > left.0 && one.time < right.0 && !rules.takes(one.quality);
+        let mut between = inside((left.0, right.0)).iter();
+        let skips = between.any(|one| !rules.takes(one.quality));
         let is_held = last.is_none_or(|last| last < right.0);
-        if !is_held && !samples.iter().any(skipped) {
+        if !is_held && !skips {
             good += time;
         }
     }
@@ -293,6 +296,11 @@ fn average_over_time(samples: &[Sample], (from, to): (i64, i64), rules: Rules) -
 /// 10000-13, 5.4.3.22).
 fn time_good(samples: &[Sample], (from, to): (i64, i64)) -> f64 {
     let mut good = 0.0;
+    let first = samples.partition_point(|one| one.time <= from);
+    let end = samples.partition_point(|one| one.time < to);
+    let samples = samples
+        .get(first.saturating_sub(1)..end)
+        .unwrap_or_default();
     let nexts = samples.iter().skip(1).map(|next| next.time);
     for (sample, next) in samples.iter().zip(nexts.chain([i64::MAX])) {
         let (begin, end) = (sample.time.max(from), next.min(to));
