@@ -243,28 +243,7 @@ impl Told {
     }
 }
 
-impl Event for Told {
-    fn get_field(
-        &self,
-        type_definition_id: &NodeId,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        browse_path: &[QualifiedName],
-    ) -> Variant {
-        if !self.types.contains(type_definition_id) {
-            return Variant::Empty;
-        }
-        self.get_value(attribute_id, index_range, browse_path)
-    }
-
-    fn time(&self) -> &DateTime {
-        &self.base.time
-    }
-
-    fn event_type_id(&self) -> &NodeId {
-        &self.base.event_type
-    }
-}
+crate::impl_event!(Told, |event, id| event.types.contains(id));
 
 impl EventField for Told {
     fn get_value(

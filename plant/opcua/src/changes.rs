@@ -92,29 +92,7 @@ impl Changed {
     }
 }
 
-impl Event for Changed {
-    fn get_field(
-        &self,
-        type_definition_id: &NodeId,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        browse_path: &[QualifiedName],
-    ) -> Variant {
-        let is_own = TYPES.iter().any(|known| *type_definition_id == *known);
-        if !is_own {
-            return Variant::Empty;
-        }
-        self.get_value(attribute_id, index_range, browse_path)
-    }
-
-    fn time(&self) -> &DateTime {
-        &self.base.time
-    }
-
-    fn event_type_id(&self) -> &NodeId {
-        &self.base.event_type
-    }
-}
+crate::impl_event!(Changed, |_, id| TYPES.iter().any(|known| *id == *known));
 
 impl EventField for Changed {
     fn get_value(

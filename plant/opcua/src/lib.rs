@@ -24,6 +24,8 @@ pub mod endpoint;
 #[cfg(feature = "server")]
 pub mod enrolment;
 #[cfg(feature = "server")]
+mod event;
+#[cfg(feature = "server")]
 pub mod file;
 pub mod judge;
 pub mod known;

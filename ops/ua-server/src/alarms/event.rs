@@ -362,33 +362,14 @@ pub(crate) struct RefreshEvent {
     base: BaseEventType,
 }
 
-impl Event for RefreshEvent {
-    fn get_field(
-        &self,
-        type_definition_id: &NodeId,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        browse_path: &[QualifiedName],
-    ) -> Variant {
-        let types = [
-            self.kind,
-            ObjectTypeId::SystemEventType,
-            ObjectTypeId::BaseEventType,
-        ];
-        if !types.iter().any(|known| *type_definition_id == *known) {
-            return Variant::Empty;
-        }
-        self.get_value(attribute_id, index_range, browse_path)
-    }
-
-    fn time(&self) -> &DateTime {
-        &self.base.time
-    }
-
-    fn event_type_id(&self) -> &NodeId {
-        &self.base.event_type
-    }
-}
+plant_opcua::impl_event!(RefreshEvent, |event, id| {
+    let types = [
+        event.kind,
+        ObjectTypeId::SystemEventType,
+        ObjectTypeId::BaseEventType,
+    ];
+    types.iter().any(|known| *id == *known)
+});
 
 impl EventField for RefreshEvent {
     fn get_value(

@@ -162,28 +162,7 @@ impl Raised {
     }
 }
 
-impl Event for Raised {
-    fn get_field(
-        &self,
-        type_definition_id: &NodeId,
-        attribute_id: AttributeId,
-        index_range: &NumericRange,
-        browse_path: &[QualifiedName],
-    ) -> Variant {
-        if !self.types.contains(type_definition_id) {
-            return Variant::Empty;
-        }
-        self.get_value(attribute_id, index_range, browse_path)
-    }
-
-    fn time(&self) -> &DateTime {
-        &self.base.time
-    }
-
-    fn event_type_id(&self) -> &NodeId {
-        &self.base.event_type
-    }
-}
+crate::impl_event!(Raised, |event, id| event.types.contains(id));
 
 impl EventField for Raised {
     fn get_value(

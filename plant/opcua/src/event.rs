@@ -1,0 +1,32 @@
+//! Events with the fields of BaseEventType and own fields.
+
+/// Implements `Event` for a type with a field `base: BaseEventType`. The closure returns true for
+/// the types whose select clauses apply to the event.
+#[macro_export]
+macro_rules! impl_event {
+    ($event:ty, $is_of:expr) => {
+        impl opcua::nodes::Event for $event {
+            fn get_field(
+                &self,
+                type_definition_id: &opcua::types::NodeId,
+                attribute_id: opcua::types::AttributeId,
+                index_range: &opcua::types::NumericRange,
+                browse_path: &[opcua::types::QualifiedName],
+            ) -> opcua::types::Variant {
+                let is_of: fn(&Self, &opcua::types::NodeId) -> bool = $is_of;
+                if !is_of(self, type_definition_id) {
+                    return opcua::types::Variant::Empty;
+                }
+                opcua::nodes::EventField::get_value(self, attribute_id, index_range, browse_path)
+            }
+
+            fn time(&self) -> &opcua::types::DateTime {
+                &self.base.time
+            }
+
+            fn event_type_id(&self) -> &opcua::types::NodeId {
+                &self.base.event_type
+            }
+        }
+    };
+}
