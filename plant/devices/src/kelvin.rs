@@ -238,7 +238,9 @@ impl Changer {
         let Mover::Component(partner) = &self.mover else {
             return;
         };
-        if !self.shown.borrow().mover.is_empty() {
+        // The endpoint of a robot that is named by its ApplicationUri changes when it restarts.
+        let is_called = matches!(partner, Some(Partner::Called(_)));
+        if !is_called && !self.shown.borrow().mover.is_empty() {
             return;
         }
         if let Ok((endpoint, _)) = peers.robot(partner.as_ref()).await {

@@ -225,9 +225,13 @@ impl Hold {
     }
 
     /// Returns the pose of the flange at this distance before the part, along the z axis of the
-    /// tool.
+    /// tool; above the part if the gripper states no grip point.
     pub(crate) fn before(&self, part: [f64; 6], distance: f64) -> [f64; 6] {
-        let [.., a, b, c] = part;
+        let [x, y, z, a, b, c] = part;
+        if self.flange.is_none() {
+            // The z axis of a flange usually points down, towards the part.
+            return [x, y, z + distance, a, b, c];
+        }
         let above = Frame::of_pose(part).then(&Frame::at([0.0, 0.0, distance]));
         let [x, y, z] = above.position();
         self.at([x, y, z, a, b, c])
@@ -278,6 +282,15 @@ mod tests {
         let why = CUP.on(Some(&ball)).unwrap_err();
         assert_eq!(why, "the part has no flat top for vacuum");
         assert!(FINGERS.on(Some(&ball)).is_ok() && CUP.on(None).is_ok());
+    }
+
+    #[test]
+    fn the_approach_without_a_grip_point_is_above_a_flange_that_points_down() {
+        let hold = Hold::new(None, &Frame::IDENTITY, None).unwrap();
+        let down = [0.4, 0.2, 0.1, std::f64::consts::PI, 0.0, 0.0];
+        let before = hold.before(down, 0.05);
+        assert!((before[2] - 0.15).abs() < 1e-12, "{before:?}");
+        assert_eq!(before[3..], down[3..]);
     }
 
     #[test]

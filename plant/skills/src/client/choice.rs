@@ -171,17 +171,22 @@ impl PeerAccess {
     /// Reads the state of all tool changers.
     async fn changers(&self, detector: &Detector) -> Vec<(String, ToolState)> {
         let of = TypeName::own("ToolSkillType");
-        let mut endpoints: BTreeMap<String, String> = BTreeMap::new();
+        let mut endpoints: BTreeMap<String, (String, ToolState)> = BTreeMap::new();
         for found in detector.of_type(&of) {
-            if found.skill.tool_state.is_some() {
-                endpoints.insert(found.endpoint, found.application_uri);
+            if let Some(state) = found.skill.tool_state {
+                endpoints.insert(found.endpoint, (found.application_uri, state));
             }
         }
         let mut states = Vec::new();
-        for (endpoint, application_uri) in endpoints {
-            // The state may be newer than discovery. A changer that does not answer moves nothing.
+        for (endpoint, (application_uri, known)) in endpoints {
+            // The state may be newer than discovery. The tool of a changer that does not answer is
+            // unknown.
             let state = timeout(READ_WITHIN, self.tool_state(&endpoint)).await;
-            let state = state.ok().flatten().unwrap_or_default();
+            let state = state.ok().flatten();
+            let state = state.unwrap_or(ToolState {
+                current: None,
+                ..known
+            });
             states.push((application_uri, state));
         }
         states

@@ -62,9 +62,15 @@ pub(super) fn serve(
         let [Variant::UInt32(delay)] = request.arguments.as_slice() else {
             return Err(Refusal::from(StatusCode::BadInvalidArgument));
         };
+        if *delay > LONGEST_DELAY_MS {
+            return Err(Refusal::from(StatusCode::BadOutOfRange));
+        }
         tracing::info!(delay, application = ?request.caller.application_uri, "switched off");
         (power_off.0)(Duration::from_millis((*delay).into()));
         Ok(Vec::new())
     });
     server.add_method(spec, handler)
 }
+
+/// Longest delay; a run that starts meanwhile is halted by the end of the program.
+const LONGEST_DELAY_MS: u32 = 60_000;
