@@ -358,7 +358,8 @@ impl Execution<'_> {
                     return Ended::Over(format!("stopped, but {name} may go on: {fault}"));
                 }
             };
-            let goes_on = matches!(outcome, Err(SkillFault::NotHalted(_)));
+            // The run of a lost component may go on; another component must not repeat it.
+            let goes_on = matches!(outcome, Err(SkillFault::NotHalted(_) | SkillFault::Lost(_)));
             let why = match outcome {
                 Ok(outcome) if outcome.succeeded => continue,
                 Ok(outcome) => outcome.message,

@@ -52,7 +52,7 @@ fn located(answer: &Answer, id: &str) -> Result<Results, String> {
 }
 
 /// Reads exactly so many finite numbers, separated by spaces.
-fn numbers_of(text: &str, count: usize) -> Option<Vec<f64>> {
+pub(crate) fn numbers_of(text: &str, count: usize) -> Option<Vec<f64>> {
     let numbers: Vec<f64> = text
         .split_whitespace()
         .map(|number| {

@@ -7,6 +7,7 @@ use knowledge::{Answer, Knowledge};
 use serde_json::Value;
 use skills::TypeName;
 
+use crate::locate_skill::numbers_of;
 use crate::process::{By, Given, Job, Need, Process, Role, Step};
 
 /// The processes of the graph: each can run, or has a reason why it cannot.
@@ -113,10 +114,7 @@ fn job(rows: &[&Row]) -> Result<Option<skills::Job>, String> {
             return Ok(None);
         };
         let text = value.as_str().unwrap_or_default();
-        let numbers = text
-            .split_ascii_whitespace()
-            .map(|number| number.parse().ok());
-        let numbers: Option<Vec<f64>> = numbers.collect();
+        let numbers = numbers_of(text, 6);
         let position = numbers.and_then(|numbers| numbers.try_into().ok());
         position
             .map(Some)
@@ -125,11 +123,17 @@ fn job(rows: &[&Row]) -> Result<Option<skills::Job>, String> {
     let (Some(pick), Some(place)) = (position("pick")?, position("place")?) else {
         return Ok(None);
     };
-    let approach = one(rows, "approach")?.and_then(Value::as_f64);
+    let approach = match one(rows, "approach")? {
+        None => USUALLY_APPROACH,
+        Some(value) => value
+            .as_f64()
+            .filter(|approach| (0.0..=10.0).contains(approach))
+            .ok_or_else(|| format!("its ua:approach is not from 0 to 10 m: {value}"))?,
+    };
     Ok(Some(skills::Job {
         pick,
         place,
-        approach: approach.unwrap_or(USUALLY_APPROACH),
+        approach,
         shape: shape(rows)?,
     }))
 }
