@@ -56,7 +56,7 @@ impl Driver for Program {
     }
 
     async fn run(&self, work: Work) -> Result<Results, String> {
-        let mut child = self.start(&self.work.command)?;
+        let mut child = self.start(&self.work.command, Stdio::piped)?;
         let group = child
             .id()
             .and_then(|id| i32::try_from(id).ok())
@@ -82,7 +82,7 @@ impl Driver for Program {
 
 impl Program {
     /// Starts a command without the environment of this program, which may contain secrets.
-    fn start(&self, command: &[String]) -> Result<Child, String> {
+    fn start(&self, command: &[String], stream: fn() -> Stdio) -> Result<Child, String> {
         let (program, arguments) = command.split_first().ok_or("no program is named")?;
         let kept = KEPT_VARIABLES.iter();
         let kept = kept.filter_map(|name| Some((*name, std::env::var_os(name)?)));
@@ -91,9 +91,9 @@ impl Program {
             .current_dir(&self.work.folder)
             .env_clear()
             .envs(kept)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
+            .stdin(stream())
+            .stdout(stream())
+            .stderr(stream())
             .process_group(0)
             .kill_on_drop(true)
             .spawn();
@@ -175,11 +175,10 @@ impl Program {
         let Some(command) = &self.work.stop else {
             return "there is no `stop` command".to_owned();
         };
-        let mut child = match self.start(command) {
+        let mut child = match self.start(command, Stdio::null) {
             Ok(child) => child,
             Err(why) => return format!("the `stop` command has failed: {why}"),
         };
-        drop((child.stdin.take(), child.stdout.take(), child.stderr.take()));
         let group = child
             .id()
             .and_then(|id| i32::try_from(id).ok())
@@ -263,23 +262,33 @@ async fn next_line(
     }
 }
 
-/// Logs the standard error of a program.
+/// Logs the standard error of a program to its end.
 async fn log(skill: &str, mut errors: impl AsyncBufRead + Unpin) {
     let mut line = Vec::new();
-    while let Ok(Some(text)) = next_line(&mut errors, &mut line).await {
-        info!(skill, "{}", text.escape_debug());
+    loop {
+        match next_line(&mut errors, &mut line).await {
+            Ok(Some(text)) => show(skill, &text),
+            Ok(None) => return show(skill, &String::from_utf8_lossy(&line)),
+            Err(_) if line.is_empty() => return,
+            Err(_) => {
+                show_discarded(skill);
+                line.clear();
+            }
+        }
     }
-    warn_of_long_line(skill, &line);
 }
 
-fn warn_of_long_line(skill: &str, line: &[u8]) {
-    if !line.is_empty() {
-        warn!(
-            skill,
-            bytes = line.len(),
-            "stopped reading the standard error of the program"
-        );
+fn show(skill: &str, text: &str) {
+    if !text.is_empty() {
+        info!(skill, "{}", text.escape_debug());
     }
+}
+
+fn show_discarded(skill: &str) {
+    warn!(
+        skill,
+        "discarded a part of a long line of the standard error"
+    );
 }
 
 /// A line of a program.
