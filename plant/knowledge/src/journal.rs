@@ -99,8 +99,12 @@ impl Journal {
         contents.damaged = whole - length;
         if contents.damaged > 0 {
             file.seek(SeekFrom::Start(length))?;
-            let mut rest = File::create(folder.join(DAMAGED))?;
+            let mut rest = OpenOptions::new()
+                .create(true)
+                .append(true)
+                .open(folder.join(DAMAGED))?;
             io::copy(&mut file, &mut rest)?;
+            rest.sync_all()?;
             file.set_len(length)?;
             file.sync_all()?;
         }
@@ -138,12 +142,25 @@ impl Journal {
             return Err(error);
         }
         self.length += u64::try_from(bytes.len()).unwrap_or(u64::MAX);
-        if self.length > self.compact.saturating_mul(2).saturating_add(SLACK) {
-            self.file.seek(SeekFrom::Start(0))?;
-            let (contents, _) = read(&self.file)?;
-            self.write_anew(&contents.graphs)?;
+        if self.length > self.compact.saturating_mul(2).saturating_add(SLACK)
+            && let Err(error) = self.shrink()
+        {
+            // The records are on the disk.
+            tracing::warn!(%error, "cannot write the journal anew");
+            self.compact = self.length;
         }
         Ok(())
+    }
+
+    /// Writes the file anew from its own contents.
+    fn shrink(&mut self) -> io::Result<()> {
+        self.file.seek(SeekFrom::Start(0))?;
+        let (contents, length) = read(&self.file)?;
+        if length != self.length {
+            let why = "the journal cannot be read to its end";
+            return Err(io::Error::new(io::ErrorKind::InvalidData, why));
+        }
+        self.write_anew(&contents.graphs)
     }
 
     /// Writes a new file without outdated records, and replaces the old one.
@@ -167,12 +184,13 @@ impl Journal {
         writer.flush()?;
         drop(writer);
         file.sync_all()?;
+        let length = file.stream_position()?;
         fs::rename(&new, self.folder.join(NAME))?;
-        File::open(&self.folder)?.sync_all()?;
-        self.length = file.stream_position()?;
-        self.compact = self.length;
+        // The old file has no name any longer.
+        self.length = length;
+        self.compact = length;
         self.file = file;
-        Ok(())
+        File::open(&self.folder)?.sync_all()
     }
 }
 
@@ -373,6 +391,25 @@ mod tests {
         };
         assert_eq!(writing.change(&graph(), change).unwrap(), 1);
         writing.commit(7).unwrap();
+    }
+
+    #[test]
+    fn a_statement_that_is_added_and_removed_in_one_change_leaves_the_others() {
+        let folder = test_folder("journal-undone");
+        {
+            let (knowledge, _) = Knowledge::open(&folder).unwrap();
+            add(&knowledge, 0);
+            let mut writing = knowledge.write().unwrap();
+            for (added, removed) in [(vec![triple(1)], vec![]), (vec![], vec![triple(1)])] {
+                writing.change(&graph(), Change { added, removed }).unwrap();
+            }
+            writing.commit(8).unwrap();
+        }
+        let (knowledge, damaged) = Knowledge::open(&folder).unwrap();
+        assert_eq!(damaged, 0);
+        let mut sources = knowledge.sources().into_iter();
+        let kept = sources.find(|status| status.graph == UNNAMED).unwrap();
+        assert_eq!(kept.statements, 1);
     }
 
     #[test]

@@ -22,7 +22,7 @@ use tokio::time::Instant;
 
 use crate::bounds;
 use crate::lanes::{Lane, Lanes};
-use crate::question::{Answer, Question};
+use crate::question::{Answer, MOST_ROWS, Question};
 use crate::store::{Knowledge, KnowledgeFault};
 use crate::update::{self, Updated};
 
@@ -360,10 +360,14 @@ impl Work {
             .execute()
             .map_err(|error| self.fault(&error))?;
         match (results, &self.asked) {
-            (QueryResults::Solutions(solutions), Asked::Question(question, _)) => question
-                .answer(solutions)
-                .map(Results::Answer)
-                .map_err(|error| self.fault(&error)),
+            (QueryResults::Solutions(solutions), Asked::Question(question, _)) => {
+                let answer = question.answer(solutions);
+                let answer = answer.map_err(|error| self.fault(&error))?;
+                match answer.rows.len() < MOST_ROWS {
+                    true => Ok(Results::Answer(answer)),
+                    false => Err(self.too_much()),
+                }
+            }
             (QueryResults::Solutions(solutions), Asked::Sparql(.., formats)) => self.solutions(
                 solutions,
                 formats

@@ -239,7 +239,7 @@ impl Question {
             .collect();
         let lists: Vec<&str> = self.lists().collect();
         let mut rows = Vec::new();
-        for solution in solutions {
+        for solution in solutions.take(MOST_ROWS) {
             let solution = solution?;
             let value = |column: &String| {
                 let term = solution.get(column.as_str());
@@ -292,9 +292,15 @@ impl Knowledge {
             .parse_query(&sparql)
             .map_err(|error| fault(error.to_string()))?;
         match prepared.on_store(self.store()).execute() {
-            Ok(QueryResults::Solutions(solutions)) => question
-                .answer(solutions)
-                .map_err(|error| fault(error.to_string())),
+            Ok(QueryResults::Solutions(solutions)) => {
+                let answer = question
+                    .answer(solutions)
+                    .map_err(|error| fault(error.to_string()))?;
+                if answer.rows.len() >= MOST_ROWS {
+                    return Err(fault(format!("it has {MOST_ROWS} rows or more")));
+                }
+                Ok(answer)
+            }
             Ok(QueryResults::Boolean(_) | QueryResults::Graph(_)) => {
                 Err(fault("it is no SELECT".to_owned()))
             }
@@ -387,3 +393,6 @@ fn key(value: &Value) -> (u64, String) {
         Value::Bool(_) | Value::Array(_) | Value::Object(_) => (u64::MAX, value.to_string()),
     }
 }
+
+/// Maximum number of rows of an answer. An answer with as many rows is incomplete.
+pub(crate) const MOST_ROWS: usize = 100_000;

@@ -153,9 +153,10 @@ impl Running<'_> {
         };
         for (solution, row) in solutions.zip(0_usize..) {
             let solution = solution.map_err(failed)?;
-            if row >= MOST_ROWS {
+            let of_row = delete.len().saturating_add(insert.len()).max(1);
+            if row.saturating_mul(of_row) >= MOST_CHANGES {
                 return Err(QueryFault::TooComplex(format!(
-                    "its pattern has more than {MOST_ROWS} solutions"
+                    "it changes more than {MOST_CHANGES} statements"
                 )));
             }
             // A blank node of the template is another node for each solution.
@@ -343,4 +344,5 @@ fn graph(pattern: &GraphNamePattern, solution: &QuerySolution) -> Option<GraphNa
 
 /// The prefix of the graphs that are made from sources.
 const OURS: &str = "urn:ua-bridge:graph:";
-const MOST_ROWS: usize = 1_000_000;
+/// Maximum number of statements that an operation changes.
+const MOST_CHANGES: usize = 1_000_000;

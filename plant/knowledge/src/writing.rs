@@ -197,6 +197,7 @@ impl<'a> Writing<'a> {
             let mut records: Vec<_> = removed.map(|source| Record::Remove { source }).collect();
             if self.lasting == Lasting::Yes {
                 let puts = self.whole.iter();
+                let puts = puts.filter(|(source, _)| !self.removed.contains(*source));
                 records.extend(puts.map(|(source, triples)| Record::Put {
                     source,
                     at,
@@ -234,9 +235,10 @@ impl<'a> Writing<'a> {
 impl Change {
     /// Adds a later change.
     fn then(&mut self, later: Self) {
-        let removed: HashSet<&Triple> = later.removed.iter().collect();
-        self.added.retain(|triple| !removed.contains(triple));
-        self.removed.extend(later.removed);
+        // The removal of an added statement undoes the addition.
+        let mut removed: HashSet<Triple> = later.removed.into_iter().collect();
+        self.added.retain(|triple| !removed.remove(triple));
+        self.removed.extend(removed);
         self.added.extend(later.added);
     }
 }
