@@ -48,7 +48,7 @@ fn rules(mapping: &Mapping) -> Result<String, Failure> {
         }
         shared(&mut text, prefix);
     }
-    let _written = writeln!(text, "\n# ua-space\nuser tools");
+    let _written = writeln!(text, "\n# ua-space; may also request each call\nuser tools");
     shared(&mut text, prefix);
     Ok(text)
 }
@@ -75,17 +75,19 @@ fn names(broker: &Broker, mapping: &Mapping, space: SpaceId) -> Vec<String> {
 }
 
 /// The types of messages that only the publisher in the topic sends.
-const OF_PUBLISHER: [&str; 8] = [
+const OF_PUBLISHER: [&str; 10] = [
     "data",
     "metadata",
     "status",
     "connection",
     "application",
+    "endpoints",
+    "discovery",
     "action-response",
     "action-metadata",
     "action-responder",
 ];
-const OF_ALL: [&str; 2] = ["action-request", "discovery"];
+const OF_ALL: [&str; 2] = ["action-request", "probe"];
 
 #[cfg(test)]
 mod tests {
@@ -115,7 +117,8 @@ variables:
             assert_eq!(user.contains("topic write cell/ua_2_5_10"), own == 2);
         }
         let tools = users.next().unwrap();
-        assert!(!tools.contains("/data/") && tools.contains("topic read cell/#"));
+        assert!(!tools.contains("/data/") && !tools.contains("/discovery/"));
+        assert!(tools.contains("topic read cell/#"));
     }
 
     #[test]

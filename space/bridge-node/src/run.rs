@@ -299,12 +299,13 @@ impl<P: Port> Shell<P> {
                 if let Some(source) = self.carrier.source() {
                     self.router.set_source(source);
                 }
-                self.router.set_relay(relay(self.carrier.as_ref()));
                 // The probes of the start may have been lost.
                 self.router.call_the_roll(now());
                 info!(%interface, "the PubSub network is within reach: hearing and sending there again");
             }
         }
+        // A broker may have another limit after each connection.
+        self.router.set_relay(relay(self.carrier.as_ref()));
     }
 
     /// Checks the network interfaces of the local side; fails if the local side cannot follow a

@@ -32,7 +32,7 @@ pub(crate) fn of(message: &NetworkMessage<'_>, own: Option<u16>) -> Option<Addre
         withdrawn: None,
     };
     match message.message_type() {
-        NetworkMessageType::Probe => Some(addressed(alone(MessageType::Discovery, publisher))),
+        NetworkMessageType::Probe => Some(addressed(alone(MessageType::Probe, publisher))),
         NetworkMessageType::Announcement => Some(announcement(message, publisher)),
         NetworkMessageType::DataSet if is_action(message) => {
             Some(addressed(address(action_kind(message, publisher, own))))

@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Sleep, sleep};
 use transport::{Carrier, CarrierChange, Outgoing, Received, SendError, Senders};
 use uadp::discovery::ConnectionState;
-use uadp::{NetworkMessage, Timestamp};
+use uadp::{NetworkMessage, NetworkMessageType, Timestamp};
 
 use crate::address::{self, Addressed};
 use crate::connection::{Link, Shared, State, instant, run};
@@ -116,7 +116,8 @@ impl Mqtt {
     }
 
     /// Publishes a retained message now and with each connection.
-    fn keep(&self, publication: Publication) {
+    fn keep(&mut self, publication: Publication) {
+        self.echo.sent(&publication.topic, &publication.payload);
         let mut state = self.shared.state();
         let State {
             queue, kept, link, ..
@@ -130,6 +131,13 @@ impl Mqtt {
         }
         drop(state);
         self.shared.wake();
+    }
+
+    /// Returns whether a message is an own retained message.
+    fn is_kept(&self, topic: &str, payload: &[u8]) -> bool {
+        let state = self.shared.state();
+        let kept = state.kept.get(topic);
+        kept.is_some_and(|own| own.payload == payload)
     }
 
     /// Clears a retained message.
@@ -198,7 +206,7 @@ impl Mqtt {
         let Address {
             kind, publisher, ..
         } = read.address;
-        if self.echo.is_own(topic, payload) {
+        if self.echo.is_own(topic, payload) || self.is_kept(topic, payload) {
             return Err("own");
         }
         if payload.is_empty() {
@@ -300,6 +308,12 @@ impl Mqtt {
         let Address {
             kind, publisher, ..
         } = address;
+        if !matches!(
+            kind,
+            MessageType::Data | MessageType::MetaData | MessageType::Status
+        ) {
+            return Err("other_topic");
+        }
         let is_own = self.settings.publisher == Some(publisher);
         if *retained && kind != MessageType::Status {
             let runs = self.producers.is_operational(publisher, now);
@@ -319,6 +333,9 @@ impl Mqtt {
             }
         }
         let reading = self.json.read(payload, address)?;
+        if reading.status.is_some() != (kind == MessageType::Status) {
+            return Err("other_publisher");
+        }
         for fault in reading.faults {
             self.count(fault);
         }
@@ -594,18 +611,35 @@ impl Drop for Mqtt {
     }
 }
 
-/// Returns whether the group and writer of a message are those of its topic, as far as the topic
-/// names them.
+/// Returns whether the type, the group and the writer of a message are those of its topic, as far
+/// as the topic names them.
 fn agrees(network: &NetworkMessage<'_>, address: Address) -> bool {
-    if address.kind != MessageType::Data {
-        return true;
+    let kind = address.kind;
+    let is_call = matches!(
+        kind,
+        MessageType::ActionRequest | MessageType::ActionResponse
+    );
+    match network.message_type() {
+        NetworkMessageType::Probe => return kind == MessageType::Probe,
+        NetworkMessageType::Announcement => {
+            return !is_call && !matches!(kind, MessageType::Data | MessageType::Probe);
+        }
+        NetworkMessageType::DataSet => {}
+    }
+    let found = address::of(network, None).map(|of| of.address.kind);
+    // A sealed message or a chunk does not show whether it is a request or a response.
+    let is_hidden = is_call && (network.is_sealed() || network.is_chunk());
+    if found != Some(kind) && !(is_hidden && found == Some(MessageType::ActionRequest)) {
+        return false;
     }
     let group = network.group().and_then(|group| group.writer_group_id);
     let is_group = address.group.is_none_or(|wanted| group == Some(wanted));
-    let is_writer = address.writer.is_none_or(|wanted| {
-        let writers = network.writer_ids();
-        writers.is_none_or(|mut writers| writers.all(|id| id == wanted))
-    });
+    let is_writer = address
+        .writer
+        .is_none_or(|wanted| match network.writer_ids() {
+            Some(mut writers) => writers.all(|id| id == wanted),
+            None => !is_call,
+        });
     is_group && is_writer
 }
 
@@ -632,6 +666,7 @@ const fn message_type(kind: MessageType) -> &'static str {
         MessageType::ActionMetaData => "ua-action-metadata",
         MessageType::ActionResponder => "ua-action-responder",
         MessageType::Discovery => "ua-discovery",
+        MessageType::Probe => "ua-probe",
     }
 }
 
@@ -656,3 +691,43 @@ const LONGEST_TOPIC: usize = 64;
 const MAX_RECEIVED: usize = 4096;
 const MAX_KEPT: usize = 65_536;
 const CLOSED_POLL: Duration = Duration::from_millis(10);
+
+#[cfg(test)]
+mod tests {
+    use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId};
+
+    use super::*;
+
+    #[test]
+    fn a_value_is_accepted_at_the_topic_of_its_writer_only() {
+        let network = NetworkHeader {
+            publisher_id: Some(PublisherId::UInt16(1)),
+            group: Some(GroupHeader {
+                writer_group_id: Some(2),
+                ..GroupHeader::default()
+            }),
+            ..NetworkHeader::default()
+        };
+        let mut bytes = Vec::new();
+        let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&[10])).unwrap();
+        message.keep_alive(&DataSetHeader::default()).unwrap();
+        message.finish().unwrap();
+        let message = NetworkMessage::decode(&bytes).unwrap();
+        for kind in MessageType::ALL {
+            let address = Address {
+                kind,
+                publisher: 1,
+                group: Some(2),
+                writer: Some(10),
+            };
+            let is_data = kind == MessageType::Data;
+            assert_eq!(agrees(&message, address), is_data, "{kind:?}");
+            let other = Address {
+                writer: Some(11),
+                ..address
+            };
+            assert!(!agrees(&message, other), "{kind:?}");
+            assert_eq!(agrees(&message, alone(kind, 1)), is_data, "{kind:?}");
+        }
+    }
+}

@@ -119,6 +119,7 @@ pub(crate) async fn run(
     let mut version = settings.broker.version.unwrap_or(MqttVersion::V5);
     loop {
         let before = shared.state().connections;
+        let began = TokioInstant::now();
         let mut session = Session::new(&settings, &shared, version);
         let ended = session.run(&received).await;
         if session.refuses_version && settings.broker.version.is_none() {
@@ -127,7 +128,8 @@ pub(crate) async fn run(
                 MqttVersion::V3_1_1 => MqttVersion::V5,
             };
         }
-        if shared.state().connections > before {
+        // A broker that accepts and closes at once is no reason to hurry.
+        if shared.state().connections > before && began.elapsed() > LAST_PAUSE {
             pause = FIRST_PAUSE;
         }
         match ended {
@@ -140,7 +142,7 @@ pub(crate) async fn run(
         let jitter = Duration::from_millis(random() % 100);
         tokio::select! {
             () = sleep(pause + jitter) => {}
-            () = shared.wake.notified() => {}
+            () = session.closing() => {}
         }
         pause = (pause * 2).min(LAST_PAUSE);
     }
@@ -318,7 +320,9 @@ impl<'a> Session<'a> {
             let Some(waiting) = state.queue.pop(now) else {
                 return state.closing && self.out.0.is_empty();
             };
-            if waiting.0.confirmed && self.unconfirmed.len() >= MAX_UNCONFIRMED {
+            let is_full = self.unconfirmed.len() >= MAX_UNCONFIRMED
+                || self.protocol.get_receive_maximum_vacancy_for_send() == Some(0);
+            if waiting.0.confirmed && is_full {
                 state.queue.unpop(waiting);
                 return false;
             }
@@ -340,7 +344,17 @@ impl<'a> Session<'a> {
             false => None,
         };
         match packets::publish(publication, (self.version, id)) {
-            Ok(packet) => self.send(packet),
+            Ok(packet) => {
+                let before = self.out.0.len();
+                self.send(packet);
+                if self.out.0.len() == before {
+                    // The library refuses the packet.
+                    if let Some(id) = id {
+                        self.unconfirmed.remove(&id);
+                    }
+                    warn!("the broker does not take a message of this size");
+                }
+            }
             Err(error) => warn!(?error, "cannot publish a message at the broker"),
         }
     }

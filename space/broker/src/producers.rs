@@ -109,7 +109,7 @@ fn time_left(next: DateTime, utc: Timestamp) -> Option<Duration> {
 /// The tolerated lateness of a status in nanoseconds.
 const MARGIN: i128 = 3_000_000_000;
 const MAX_PRODUCERS: usize = 1024;
-const MAX_HELD: usize = 16_384;
+const MAX_HELD: usize = 2_048;
 const MAX_HELD_BYTES: usize = 65_536;
 
 #[cfg(test)]

@@ -17,13 +17,15 @@ pub(crate) enum MessageType {
     ActionResponse,
     ActionMetaData,
     ActionResponder,
-    /// A probe, or an announcement whose content is encrypted. These are no part of the standard,
-    /// which relies on retained messages.
+    /// An announcement that is encrypted or in chunks. It is no part of the standard, which relies
+    /// on retained messages.
     Discovery,
+    /// A probe, which any program may send to the publisher. It is no part of the standard.
+    Probe,
 }
 
 impl MessageType {
-    pub(crate) const ALL: [Self; 11] = [
+    pub(crate) const ALL: [Self; 12] = [
         // The status of a publisher is subscribed first, because it decides about the rest.
         Self::Status,
         Self::MetaData,
@@ -33,6 +35,7 @@ impl MessageType {
         Self::ActionMetaData,
         Self::ActionResponder,
         Self::Discovery,
+        Self::Probe,
         Self::ActionRequest,
         Self::ActionResponse,
         Self::Data,
@@ -51,6 +54,7 @@ impl MessageType {
             Self::ActionMetaData => "action-metadata",
             Self::ActionResponder => "action-responder",
             Self::Discovery => "discovery",
+            Self::Probe => "probe",
         }
     }
 
@@ -64,7 +68,11 @@ impl MessageType {
             | Self::Endpoints
             | Self::ActionMetaData
             | Self::ActionResponder => true,
-            Self::Data | Self::ActionRequest | Self::ActionResponse | Self::Discovery => false,
+            Self::Data
+            | Self::ActionRequest
+            | Self::ActionResponse
+            | Self::Discovery
+            | Self::Probe => false,
         }
     }
 }
@@ -127,7 +135,8 @@ pub(crate) fn parse(broker: &Broker, topic: &str) -> Option<ReceivedTopic> {
     if let Ok(id) = rest.parse::<TopicId>() {
         let (publisher, group, writer) = id.triple();
         return Some(ReceivedTopic {
-            is_json: encoding(broker.encoding) == JSON,
+            // Commands and sealed values are always UADP; JSON is known by its first byte.
+            is_json: false,
             address: Address {
                 kind: MessageType::Data,
                 publisher,

@@ -438,6 +438,14 @@ impl Router {
                     let cause = late::cause(late::UNTIMED);
                     self.count_call(topic, Some(from), cause, || late::NO_TIME.to_owned());
                 }
+                (Some(topic), ActionKind::Request)
+                    if self.is_given_up(&message.header(), action.action.timeout(), now) =>
+                {
+                    let cause = late::cause(late::GIVEN_UP);
+                    self.count_call(topic, Some(from), cause, || {
+                        "its caller has stopped waiting".to_owned()
+                    });
+                }
                 (Some(topic), ActionKind::Request) => {
                     self.handle_request(topic, &action, from, now);
                 }

@@ -68,6 +68,21 @@ impl Router {
         }
     }
 
+    /// Returns whether the caller of a request has stopped waiting while a broker had the request:
+    /// `left` is its TimeoutHint.
+    pub(super) fn is_given_up(
+        &self,
+        header: &NetworkHeader<'_>,
+        left: Option<Duration>,
+        now: Now,
+    ) -> bool {
+        let (Some(_), Some(time), Some(left)) = (self.relay, header.timestamp, left) else {
+            return false;
+        };
+        let age = now.utc.unix_nanos() - Timestamp::from(time).unix_nanos();
+        age > i128::try_from(left.as_nanos()).unwrap_or(i128::MAX)
+    }
+
     /// Returns whether a request without a time of sending was received over a broker.
     pub(super) const fn is_untimed(&self, header: &NetworkHeader<'_>) -> bool {
         self.relay.is_some() && header.timestamp.is_none()
@@ -138,6 +153,7 @@ fn aged(time: Timestamp, now: Timestamp, within: Duration) -> Option<Late> {
 }
 
 /// The cause of [`Reason::Late`] for a message without a time.
+pub(super) const GIVEN_UP: &str = "given_up";
 pub(super) const UNTIMED: &str = "untimed";
 pub(super) const NO_TIME: &str =
     "it carries no time, and a broker may deliver it late; its sender must set the Timestamp";

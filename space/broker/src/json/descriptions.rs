@@ -163,8 +163,8 @@ fn meta_data<'a>(message: &NetworkMessage<'a>) -> Option<(Triple, DataSetMetaDat
         return None;
     };
     let name = meta_data.name?.split(' ').next()?;
-    let topic: TopicId = name.parse().ok()?;
-    Some((topic.triple(), meta_data))
+    let topic = name.parse::<TopicId>().ok()?.triple();
+    (crate::address::publisher(message) == Some(topic.0)).then_some((topic, meta_data))
 }
 
 const MAX_KNOWN: usize = 65_536;

@@ -36,6 +36,9 @@ impl Json {
     /// # Errors
     /// The reason why the whole message is dropped.
     pub(crate) fn read(&mut self, text: &[u8], address: Address) -> Result<Reading, &'static str> {
+        if text.len() > MAX_TEXT {
+            return Err("malformed_json");
+        }
         let json: Value = serde_json::from_slice(text).map_err(|_| "malformed_json")?;
         let mut inherited = Inherited {
             publisher: address.publisher,
@@ -112,10 +115,8 @@ impl Json {
         let has_header = whole.contains_key("Payload") || is_keep_alive;
         let empty = Map::new();
         let header = if has_header { whole } else { &empty };
-        let group = header
-            .get("WriterGroupName")
-            .and_then(number)
-            .or(inherited.group);
+        let named = header.get("WriterGroupName").and_then(number);
+        let group = inherited.group.or(named);
         let ids = ["DataSetWriterId", "DataSetWriterName"];
         let writer = ids.iter().find_map(|key| number(header.get(*key)?));
         let writer = inherited.writer.or(writer);
@@ -339,3 +340,6 @@ fn high_word(code: u32) -> u16 {
     let [high, low, ..] = code.to_be_bytes();
     u16::from_be_bytes([high, low])
 }
+
+/// The largest JSON message in bytes that is read.
+const MAX_TEXT: usize = 4 << 20;
