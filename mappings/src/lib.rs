@@ -62,6 +62,7 @@ pub use remote::{
     Access, FindSkills, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User,
 };
 pub use schema::schema;
+pub use secret::masked;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 pub use surroundings::{Readers, Surroundings};
 pub use terminal::{harmless_json, is_obeyed};

@@ -16,7 +16,7 @@ pub(crate) fn has_user(url: &str) -> bool {
 }
 
 /// Masks the passwords of a line, with as many characters as before.
-pub(crate) fn masked(text: &str) -> Cow<'_, str> {
+pub fn masked(text: &str) -> Cow<'_, str> {
     let of_urls = starred(text, passwords(text, at_sign));
     match key(&of_urls) {
         Some(at) => Cow::Owned(starred(&of_urls, std::iter::once(at)).into_owned()),

@@ -11,6 +11,7 @@ mod ros;
 
 use std::fs;
 use std::io::{self, Write as _};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
 
 use serde::Serialize;
@@ -39,7 +40,11 @@ pub(crate) fn doctor(arguments: &Doctor) -> Result<(), Failure> {
     }
     if let Some(path) = &arguments.bundle {
         let packed = bundle::pack(&facts, &findings);
-        fs::write(path, packed)
+        // The log and the rules of the firewall are not for all users.
+        let mut open = fs::OpenOptions::new();
+        open.write(true).create(true).truncate(true).mode(0o600);
+        open.open(path)
+            .and_then(|mut file| file.write_all(&packed))
             .map_err(|error| Failure::Io(format!("cannot write {}: {error}", path.display())))?;
         if !arguments.json {
             writeln!(out, "the report is in {}", path.display())?;

@@ -72,6 +72,7 @@ async fn watch(
     let start = live.start_utc();
     let mut pages: Vec<Page> = Vec::new();
     let mut asked = None;
+    let mut asking: Option<tokio::task::JoinHandle<Vec<Page>>> = None;
     let mut ticked = Duration::ZERO;
     loop {
         let next = (live.now() + STEP).min(end);
@@ -87,7 +88,13 @@ async fn watch(
         }
         if asked.is_none_or(|asked| now >= asked + PAGES) {
             asked = Some(now);
-            pages = pages_of_this_host().await;
+            // A program that hangs must not stop the keys and the group.
+            if asking.is_none() {
+                asking = Some(tokio::spawn(pages_of_this_host()));
+            }
+        }
+        if let Some(done) = asking.take_if(|asking| asking.is_finished()) {
+            pages = done.await.unwrap_or_default();
         }
         let is_due = now >= ticked + TICK || ticked.is_zero();
         if is_due {

@@ -21,8 +21,9 @@ pub(super) fn pack(facts: &Facts, findings: &[Finding]) -> Vec<u8> {
     for (at, page) in facts.pages.iter().enumerate() {
         let name = format!("status/{at}-{}-{}.json", plain(&page.program), page.space);
         add(&name, pretty(page));
-        if let Some(file) = &page.mapping.file
-            && let Ok(text) = fs::read_to_string(file)
+        // A program of another host would name a file of this host.
+        if let (Some(file), Some(_)) = (&page.mapping.file, page.pid)
+            && let Some(text) = configuration(Path::new(file))
         {
             let short = Path::new(file).file_name().unwrap_or_default();
             let short = plain(&short.to_string_lossy());
@@ -53,6 +54,19 @@ pub(super) fn pack(facts: &Facts, findings: &[Finding]) -> Vec<u8> {
     packed.finish().unwrap_or_default()
 }
 
+/// Reads a configuration. Any user may serve a status, so only regular files of YAML are read.
+fn configuration(file: &Path) -> Option<String> {
+    let file = fs::canonicalize(file).ok()?;
+    let is_yaml = file
+        .extension()
+        .is_some_and(|end| end == "yaml" || end == "yml");
+    let found = fs::metadata(&file).ok()?;
+    let is_small = found.is_file() && found.len() <= MOST_CONFIGURATION;
+    (is_yaml && is_small).then(|| fs::read_to_string(&file).ok())?
+}
+
+const MOST_CONFIGURATION: u64 = 32 << 20;
+
 fn versions(facts: &Facts) -> String {
     let system = fs::read_to_string("/proc/version").unwrap_or_default();
     let release = fs::read_to_string("/etc/os-release").unwrap_or_default();
@@ -76,40 +90,36 @@ fn plain(name: &str) -> String {
     name.map(|c| if allowed(c) { c } else { '_' }).collect()
 }
 
-/// Replaces the values of keys that name a secret, and passwords in URLs.
+/// Removes the rest of each line that names a secret, the deeper lines below it, and passwords in
+/// URLs.
 fn without_secrets(text: &str) -> String {
-    let lines = text.lines().map(|line| {
+    let mut kept = String::new();
+    // The indentation of a key whose value may continue in deeper lines.
+    let mut inside: Option<usize> = None;
+    for line in text.lines() {
+        let indent = line.len() - line.trim_start().len();
+        if inside.is_some_and(|key| line.trim().is_empty() || indent > key) {
+            continue;
+        }
         let lower = line.to_lowercase();
         let secret = SECRETS.iter().filter_map(|word| lower.find(word)).min();
-        // Lower case may have another length, so the key is taken from the lower-case line.
-        let value = secret.and_then(|at| {
-            let behind = lower.get(at..)?;
-            let colon = behind.find([':', '='])?;
-            lower.get(..at + colon + 1)
+        // Lower case may have another length, so the start is taken from the lower-case line.
+        let start = secret.and_then(|at| {
+            let is_name = |c: char| c.is_alphanumeric() || matches!(c, '_' | '-');
+            let end = lower.get(at..)?.find(|c| !is_name(c))?;
+            lower.get(..at + end)
         });
-        match value {
-            Some(kept) => format!("{kept} (removed)"),
-            None => without_password(line),
+        inside = start.is_some().then_some(indent);
+        match start {
+            Some(start) => kept.push_str(&format!("{start} (removed)")),
+            None => kept.push_str(&mappings::masked(line)),
         }
-    });
-    let mut text: String = lines.flat_map(|line| [line, "\n".to_owned()]).collect();
-    if text.trim().is_empty() {
-        text.clear();
+        kept.push('\n');
     }
-    text
-}
-
-/// Removes the user and the password of a URL.
-fn without_password(line: &str) -> String {
-    let Some((scheme, rest)) = line.split_once("://") else {
-        return line.to_owned();
-    };
-    let end = rest.find(['/', ' ', '"', '\'']).unwrap_or(rest.len());
-    let (authority, behind) = rest.split_at(end);
-    match authority.rsplit_once('@') {
-        Some((_, host)) => format!("{scheme}://(removed)@{host}{behind}"),
-        None => line.to_owned(),
+    if kept.trim().is_empty() {
+        kept.clear();
     }
+    kept
 }
 
 const SECRETS: [&str; 6] = [
@@ -157,12 +167,13 @@ mod tests {
 
     #[test]
     fn secrets_of_a_configuration_are_removed() {
-        let text = "users:\n  - {name: a, password: hunter2}\nurl: mqtt://me:pw@host:1883/x\nsigningKey: 0102\naddress: 239.0.0.1\n";
+        let text = "users:\n  - {name: a, password: hunter2}\nurl: [http://h, mqtt://me:pw@host:1883/x]\nsigningKey: 0102\n\
+                    exec: [run, --password, swordfish]\npassword: |\n  open\n  sesame\naddress: 239.0.0.1\n";
         let kept = without_secrets(text);
-        for secret in ["hunter2", "me:pw", "0102"] {
+        for secret in ["hunter2", "me:pw", "0102", "swordfish", "open", "sesame"] {
             assert!(!kept.contains(secret), "{kept}");
         }
-        assert!(kept.contains("mqtt://(removed)@host:1883/x"), "{kept}");
+        assert!(kept.contains("mqtt://me:**@host:1883/x"), "{kept}");
         assert!(kept.contains("address: 239.0.0.1"), "{kept}");
     }
 

@@ -117,9 +117,14 @@ async fn group(arguments: &Doctor) -> GroupFacts {
 }
 
 fn address(arguments: &Doctor) -> String {
-    let url = arguments.group.address.as_deref();
-    let parsed = url.and_then(mappings::PubSub::parse_address);
-    parsed.unwrap_or(mappings::PubSub::ADDRESS).to_string()
+    let group = &arguments.group;
+    let url = group.address.as_deref();
+    match url.map(mappings::PubSub::parse_address) {
+        Some(Some(address)) => address.to_string(),
+        None if group.broker.is_none() => mappings::PubSub::ADDRESS.to_string(),
+        // Checks of a multicast group do not apply.
+        Some(None) | None => "the broker".to_owned(),
+    }
 }
 
 impl Facts {

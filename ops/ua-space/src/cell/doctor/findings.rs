@@ -463,9 +463,13 @@ fn two_bridges(facts: &Facts) -> Vec<Finding> {
         let senders: Vec<&str> = senders.into_iter().collect();
         finding(
             ("D030", Error),
-            format!("space {space} has {} bridges: {}", senders.len(), senders.join(", ")),
+            format!(
+                "space {space} has {} bridges: {}",
+                senders.len(),
+                senders.join(", ")
+            ),
             "each sample crosses once for each bridge, and both publish under the same identifiers",
-            "stop all bridges of this space but one, or give them a role in `sharing` of the mapping",
+            "stop all bridges of this space but one",
         )
     });
     each.collect()
@@ -740,7 +744,7 @@ fn kernel_settings(facts: &Facts) -> Vec<Finding> {
             "waking an idle processor of a virtual machine takes up to a tenth of a millisecond",
             "set it to 200000 where delays matter more than processor time",
         );
-        found.push(with_fix(one, HALT_POLL, 200_000));
+        found.push(one);
     }
     found
 }
@@ -818,7 +822,8 @@ fn filters(facts: &Facts) -> Vec<Finding> {
         ));
     }
     for switch in &facts.host.switches {
-        if switch.snooping && !switch.querier {
+        let is_of_cell = facts.interfaces().any(|one| one.name == switch.name);
+        if switch.snooping && !switch.querier && is_of_cell {
             let path = format!("/sys/class/net/{}/bridge/multicast_querier", switch.name);
             found.push(Finding {
                 fix: Some(Fix { path, value: 1 }),

@@ -279,7 +279,11 @@ pub(super) fn output(program: &str, arguments: &[&str]) -> Option<String> {
     }
     let status = child.wait().ok();
     let _ended = reader.join();
-    let text = text.filter(|_| status.is_some_and(|status| status.success()))?;
+    // A program whose output is cut ends by a broken pipe.
+    let text = text.filter(|text| {
+        let is_cut = u64::try_from(text.len()).is_ok_and(|length| length >= MOST_OUTPUT);
+        is_cut || status.is_some_and(|status| status.success())
+    })?;
     Some(String::from_utf8_lossy(&text).into_owned())
 }
 

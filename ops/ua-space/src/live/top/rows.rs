@@ -162,7 +162,7 @@ impl Row {
             self.rate.map_or_else(dash, |rate| format!("{rate:.1}")),
             self.age.map_or_else(dash, age),
             delay,
-            self.drop_text(),
+            harmless(&self.drop_text()),
             self.quality.clone(),
             harmless(&self.type_name),
         ]

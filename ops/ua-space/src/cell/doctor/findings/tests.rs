@@ -110,7 +110,7 @@ fn faults_of_the_network_are_found() {
     assert_eq!(rules, ["D070"]);
     let switch = after(|facts| {
         facts.host.switches.push(Switch {
-            name: "br0".to_owned(),
+            name: "eth0".to_owned(),
             snooping: true,
             querier: false,
         });
