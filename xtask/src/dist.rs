@@ -188,7 +188,7 @@ fn packaged(
     patched: &Patched,
     (machine, commit): (Machine, &Commit),
 ) -> anyhow::Result<PathBuf> {
-    step("building the program of the packages (half an hour the first time)");
+    step("building the program of the packages (long the first time)");
     let mut build = patched.cargo(
         workspace,
         &["build", "--profile", SHIPPED, "--locked", "--bins"],
