@@ -1,8 +1,8 @@
 //! SPARQL 1.1 Update on the graphs of users.
 //!
 //! All operations of a request are one change: readers see either all of its effects or nothing.
-//! Statements without a graph are in the graph [`UNNAMED`]; patterns without a graph match the merge
-//! of all graphs.
+//! Statements without a graph are in the graph [`UNNAMED`]; patterns without a graph match the
+//! merge of all graphs.
 //! The graphs of components, manifests, NodeSets, processes and runs are read-only.
 
 use std::collections::{BTreeMap, HashMap};
