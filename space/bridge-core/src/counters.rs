@@ -65,7 +65,8 @@ pub enum Reason {
     IncompatibleQos,
     /// The value is unchanged, and its topic is published on change or has a deadband.
     Unchanged,
-    /// A newer value replaced the value before the rate limit of the topic allowed its publication.
+    /// A newer value replaced the value before it could be published: the rate limit of the topic
+    /// did not allow it yet, or it was not yet known whether another program writes the namespace.
     Outpaced,
     /// A request that is not executed because of its content, its source, or the number of
     /// requests; or a response that is not sent.

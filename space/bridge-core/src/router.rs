@@ -755,7 +755,12 @@ impl Router {
                 }
             }
         }
-        self.count(About::topic(topic), Reason::Overflow, count, || {
+        let keeps_latest = self.keeps_latest(topic);
+        let reason = match keeps_latest && self.is_withheld(topic) {
+            true => Reason::Outpaced,
+            false => Reason::Overflow,
+        };
+        self.count(About::topic(topic), reason, count, || {
             "the queue was full, its oldest sample was dropped".to_owned()
         });
         true

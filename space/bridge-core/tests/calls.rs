@@ -612,6 +612,22 @@ fn a_free_namespace_is_used_after_a_moment_and_nothing_is_lost_meanwhile() {
 }
 
 #[test]
+fn a_state_replaced_before_its_namespace_is_known_to_be_free_is_no_overflow() {
+    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    let value = topic(0, 7, 101);
+    let now = cell.now();
+    cell.programs[GRIPPER].router.claim(now);
+    cell.describe(GRIPPER, value, state());
+    for text in ["Starting", "Ready"] {
+        cell.say(GRIPPER, value, text);
+    }
+    cell.run(ms(400));
+    assert_eq!(cell.texts(BRIDGE, value), ["Ready"]);
+    assert_eq!(cell.dropped(GRIPPER, Reason::Overflow), 0);
+    assert_eq!(cell.dropped(GRIPPER, Reason::Outpaced), 1);
+}
+
+#[test]
 fn a_server_shows_the_values_of_components_beside_its_own() {
     let mut cell = Cell::new(vec![
         Program::new(0, Local::Fields).owning(&[2]),

@@ -103,7 +103,8 @@ impl Router {
         gathered
     }
 
-    fn keeps_latest(&self, topic: TopicId) -> bool {
+    /// Returns whether only the latest sample of a topic waits to be sent.
+    pub(super) fn keeps_latest(&self, topic: TopicId) -> bool {
         self.topics
             .get(&topic)
             .is_some_and(|entry| entry.overflow == Overflow::KeepLatest)
