@@ -30,6 +30,8 @@ pub struct Outlet {
     audience: Audience,
     /// Samples for which the send window had no room, oldest first.
     waiting: VecDeque<Sample>,
+    /// A time before which no waiting sample expires.
+    expires: Option<Instant>,
     /// Whether an expired sample was dropped and not reported yet.
     has_late: bool,
     /// The time since when the send window has no room.
@@ -141,6 +143,7 @@ impl Outlet {
             joined,
             audience: Audience::Nobody { held: None },
             waiting: VecDeque::new(),
+            expires: None,
             has_late: false,
             full_since: None,
             in_flight: 0,
@@ -354,7 +357,7 @@ impl Outlet {
         if !self.is_settled(now) {
             let bytes: usize = self.waiting.iter().map(|s| s.payload.len()).sum();
             if self.waiting.len() < self.settling_room() && bytes < MAX_IN_FLIGHT {
-                self.waiting.push_back(sample);
+                self.wait(sample);
                 return Ok(());
             }
             // Readers that have responded must not lose samples because of a silent reader.
@@ -385,10 +388,7 @@ impl Outlet {
 
     fn flush_waiting(&mut self, now: Instant) -> Result<(), Refusal> {
         self.look_back(now);
-        let before = self.waiting.len();
-        let is_late = |sample: &Sample| sample.until.is_some_and(|until| until <= now);
-        self.waiting.retain(|sample| !is_late(sample));
-        self.has_late |= self.waiting.len() < before;
+        self.drop_expired(now);
         if self.waiting.is_empty() || !self.is_settled(now) {
             return Ok(());
         }
@@ -399,6 +399,19 @@ impl Outlet {
             }
         }
         Ok(())
+    }
+
+    /// Drops the waiting samples that have expired. Looks at them only if one can have expired,
+    /// since this is called for each sample.
+    fn drop_expired(&mut self, now: Instant) {
+        let is_over = |until: Option<Instant>| until.is_some_and(|until| until <= now);
+        if !is_over(self.expires) {
+            return;
+        }
+        let before = self.waiting.len();
+        self.waiting.retain(|sample| !is_over(sample.until));
+        self.has_late |= self.waiting.len() < before;
+        self.expires = self.waiting.iter().filter_map(|sample| sample.until).min();
     }
 
     /// Updates the readers of the topic, and sends the held value to the first readers.
@@ -552,12 +565,17 @@ impl Outlet {
         if overflow {
             self.waiting.pop_front();
         }
-        self.waiting.push_back(sample);
+        self.wait(sample);
         if overflow {
             Err(Refusal::Overflow)
         } else {
             Ok(())
         }
+    }
+
+    fn wait(&mut self, sample: Sample) {
+        self.expires = self.expires.into_iter().chain(sample.until).min();
+        self.waiting.push_back(sample);
     }
 
     /// Passes a sample to RustDDS; returns it if the send window is full.
