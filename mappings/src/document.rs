@@ -22,91 +22,96 @@ pub(crate) use security::{
 };
 
 document! {
-    /// One cell: its ROS spaces, its OPC UA nodes, and which ROS topic is which node.
+    /// A cell: its ROS spaces, its OPC UA nodes, and the ROS topics that belong to the nodes.
     #[schemars(title = "UA bridge mapping")]
     struct Document {
-        /// Files that belong to this one as if they stood here, one path or a list, from the folder of this file. `*` in the
-        /// last part stands for any characters, as in robots/*.yaml.
+        /// Files that are part of this document, a single path or a list, relative to this file.
+        /// `*` in the last part matches any characters, as in robots/*.yaml.
         include: Includes,
-        /// The ROS sides of the cell. The OPC UA side is space 0 and always there.
+        /// The ROS sides of the cell. The OPC UA side is space 0 and always exists.
         spaces: Vec<At<SpaceEntry>>,
-        /// Folders with ROS packages, or single files, whose definitions (.msg, .srv, .action, .idl) count before those built in;
-        /// relative to this file. At most 256.
+        /// Folders with ROS packages, or single files, with definitions (.msg, .srv, .action, .idl)
+        /// that take precedence over built-in definitions; relative to this file. At most 256.
         type_paths: Vec<At<String>>,
         /// How values travel between the spaces.
         pubsub: PubSubEntry,
-        /// Who may write and read what is sent: SecurityGroups of OPC UA PubSub, at most 64. Left out: anybody may.
+        /// Groups of programs that may read and write messages: SecurityGroups of OPC UA PubSub, at
+        /// most 64. Default: every program of the network may.
         security: Vec<At<GroupEntry>>,
         /// The OPC UA server of the cell.
         server: ServerEntry,
-        /// OPC UA servers that exist already, such as those of PLCs, at most 256: variables come `from` them or go `to` them, and
-        /// calls are executed by Methods of theirs.
+        /// Existing OPC UA servers, such as the servers of PLCs, at most 256: variables come `from`
+        /// them or go `to` them, and their Methods execute calls.
         servers: Vec<At<RemoteServerEntry>>,
-        /// Namespace index in node ids -> namespace URI. A server may number its namespaces otherwise; the URI counts.
+        /// Namespace index in node ids -> namespace URI. A server may use other indexes; the URI
+        /// identifies the namespace.
         #[schemars(with = "Option<BTreeMap<u16, String>>")]
         namespaces: Namespaces,
         /// The values of the cell, at most 100 000.
         variables: Vec<At<VariableEntry>>,
-        /// Topics that become values as they appear, at most 1000; the first that fits counts, and an entry of `variables`
-        /// with the same topic before all.
+        /// Patterns of topics that become values when they appear, at most 1000. The first matching
+        /// pattern applies; an entry of `variables` with the same topic takes precedence.
         patterns: Vec<At<PatternEntry>>,
-        /// What is executed in one space and asked for from the others, at most 5000. Services and actions of ROS that have a name
-        /// of the space (/ua_1_2_61) need none.
+        /// Calls: executed in one space and requested from the others, at most 5000. ROS services
+        /// and actions with a name of the space (/ua_1_2_61) need no entry.
         calls: Vec<At<CallEntry>>,
     }
 
-    /// One ROS side.
+    /// A ROS side.
     struct SpaceEntry {
         /// 1 for ROS 1, 2 to 232 for ROS 2. It is the first number in topic names and the PublisherId.
         #[schemars(required, range(min = 1, max = 232))]
         id: u16,
-        /// 1 or 2. Left out: 1 for space 1, 2 for all others.
+        /// 1 or 2. Default: 1 for space 1, 2 for all others.
         #[schemars(range(min = 1, max = 2))]
         ros: u16,
-        /// DDS domain of a ROS 2 space. Left out: the number of the space.
+        /// DDS domain of a ROS 2 space. Default: the number of the space.
         #[schemars(range(max = 232))]
         domain: u16,
     }
 
     /// How values travel between the spaces.
     struct PubSubEntry {
-        /// Multicast group or unicast address and port, as opc.udp://239.192.0.40:4840 (the default), or an MQTT broker, as
-        /// mqtt://broker.local:1883 or mqtts://broker.local:8883.
+        /// Multicast group or unicast address and port, such as opc.udp://239.192.0.40:4840 (the
+        /// default), or an MQTT broker, such as mqtt://broker.local:1883 or
+        /// mqtts://broker.local:8883.
         #[schemars(regex(pattern = r"^(opc\.udp|(opc\.)?mqtts?)://"))]
         address: String,
         /// Settings of the MQTT broker in `address`.
         mqtt: MqttEntry,
-        /// Name or address of the network interface. Left out: the operating system chooses.
+        /// Name or address of the network interface. Default: the operating system chooses.
         interface: String,
         /// Hops a multicast datagram may travel. Default 1: it stays on the link.
         #[schemars(range(max = 255))]
         ttl: u16,
-        /// Which PublisherId is taken for a space: `exact` (the default) a UInt16 of its number, `any_width` its number in any
-        /// unsigned integer type.
+        /// PublisherIds that are accepted for a space: `exact` (the default) a UInt16 of its
+        /// number, `any_width` its number in any unsigned integer type.
         publisher_id: PublisherIdEntry,
         /// An unchanged value is sent again after this time; default 1s.
         #[schemars(regex(pattern = DURATION))]
         key_frame_period: String,
-        /// A writer with nothing to say says so after this time; default 1s.
+        /// A writer without new values sends a keep-alive message after this time; default 1s.
         #[schemars(regex(pattern = DURATION))]
         keep_alive_period: String,
-        /// A writer silent for this long counts as gone; default 3s, and longer than `keep_alive_period`.
+        /// A writer is lost after this time without a message; default 3s, and longer than
+        /// `keep_alive_period`.
         #[schemars(regex(pattern = DURATION))]
         receive_timeout: String,
-        /// What a writer has in its messages (its DataSetMetaData) is announced this often, beside when it begins and when it
-        /// is asked for; default 30s.
+        /// Period of the announcement of the fields of a writer (DataSetMetaData), which is also
+        /// sent at the start and on request; default 30s.
         #[schemars(regex(pattern = DURATION))]
         metadata_period: String,
-        /// Bytes of the largest datagram sent, 512 to 65507 (the default); larger NetworkMessages go in chunks of it. 1472 fits
-        /// an Ethernet frame.
+        /// Bytes of the largest datagram sent, 512 to 65507 (the default); larger NetworkMessages
+        /// are sent in chunks of this size. 1472 fits an Ethernet frame.
         #[schemars(range(min = 512, max = 65507))]
         max_datagram: u16,
         /// MiB of the largest message sent or put together from chunks, 1 to 1024; default 64.
         #[schemars(range(min = 1, max = 1024))]
         max_message: u16,
-        /// The most DataSetMessages in one datagram, 1 (the default) to 255. Of what waits to be sent, as many values of one
-        /// namespace then share a datagram of at most 1472 bytes, which spares time where very many change. Leave it at 1
-        /// with subscribers that read only the first, as open62541 does.
+        /// Maximum number of DataSetMessages in a datagram, 1 (the default) to 255. Waiting values
+        /// of one namespace then share a datagram of at most 1472 bytes, which saves time if very
+        /// many values change. Leave it at 1 with subscribers that read only the first, such as
+        /// open62541.
         #[schemars(range(min = 1, max = 255))]
         messages_per_datagram: u16,
     }
@@ -122,7 +127,8 @@ document! {
         encoding: EncodingEntry,
         /// Form of the topics of values: `tree` (the default), as opcua/uadp/data/1/2/10, or `names`, as opcua/ua_1_2_10.
         topics: TopicFormEntry,
-        /// Quality of service of values that are no commands: 0 (the default) or 1. Commands and calls are always sent with 0.
+        /// Quality of service of values that are not commands: 0 (the default) or 1. Commands and
+        /// calls are always sent with 0.
         #[schemars(range(max = 1))]
         qos: u16,
         /// Age at which a received message is dropped, because a broker may deliver it late; default 1s. Requires synchronised
@@ -158,56 +164,63 @@ document! {
         endpoint: String,
         /// ApplicationUri; default urn:ua-bridge:server.
         application_uri: String,
-        /// Security policies it offers. Left out: all of them, and `None` only where the endpoint is a loopback address.
+        /// Security policies that the server offers. Default: all, and `None` only if the endpoint
+        /// is a loopback address.
         security: Vec<At<SecurityEntry>>,
-        /// What users without a name may be: `off` (they are not let in), `observer`, `operator` or `engineer`. Left out:
-        /// observer; and operator where the endpoint is a loopback address and the server has no users.
+        /// Role of anonymous users: `off` (refused), `observer`, `operator` or `engineer`. Default:
+        /// observer; operator if the endpoint is a loopback address and the server has no users.
         anonymous: AnonymousEntry,
-        /// Whether other servers are refused at hosts that their trusted certificates do not name, as after another lease of DHCP;
-        /// default false: the server connects to them and logs a warning.
+        /// Whether other servers are refused if their trusted certificates do not include the host
+        /// of the URL, as after a new DHCP lease; default false: the server connects to them and
+        /// logs a warning.
         refuse_other_hosts: bool,
-        /// A value of another program that has been uncertain for this long is bad (BadNoCommunication), where its own `quality`
-        /// says nothing else. Left out: it stays uncertain.
+        /// A value of another program becomes bad (BadNoCommunication) after being uncertain for
+        /// this time, unless its own `quality` gives another time. Default: it stays uncertain.
         #[schemars(regex(pattern = DURATION))]
         bad_after: String,
         /// Whether the server has alarms for the publishers of the space: lost, dropped values,
         /// another clock. Default false.
         publisher_alarms: bool,
-        /// How much the server keeps of what was.
+        /// Limits of the history of the server.
         history: HistoryEntry,
-        /// How much clients may take up.
+        /// Limits for clients.
         limits: LimitsEntry,
-        /// Servers with skills that know nothing of the space, and that discovery finds: ua-server shows these skills in the space,
-        /// and has them run, as it does those of `servers` that have `skills`. Left out: none is looked for.
+        /// Servers with skills that discovery finds and that do not take part in the space:
+        /// ua-server shows their skills in the space and runs them, like the skills of `servers`
+        /// with `skills`. Default: no search.
         find_skills: FindSkillsEntry,
-        /// NodeSet2 files whose nodes the server has beside those of the mapping, in any order, relative to this file; at most 64.
-        /// A variable whose `node` is one of them makes it live; its namespace stands in `namespaces`.
+        /// NodeSet2 files with further nodes of the server, in any order, relative to this file; at
+        /// most 64. A variable whose `node` is one of these nodes gives it values; `namespaces`
+        /// lists its namespace.
         nodesets: Vec<At<String>>,
     }
 
-    /// How much the server keeps of what was, in memory.
+    /// Limits of the history that the server keeps in memory.
     struct HistoryEntry {
-        /// Values of each variable that says nothing else, 0 to 65535; default 1000.
+        /// Values of each variable without its own `history`, 0 to 65535; default 1000.
         values: u16,
         /// MiB of all of them together, 1 to 16384; default 64.
         #[schemars(range(min = 1, max = 16384))]
         megabytes: u16,
     }
 
-    /// How much clients may take up of the server. What is more is refused.
+    /// Limits for clients of the server. Requests above a limit are refused.
     struct LimitsEntry {
-        /// Sessions at once; default 50. The oldest session that was never activated gives way. Without such a session
-        /// the next one gets BadTooManySessions.
+        /// Simultaneous sessions; default 50. At the limit, the oldest session that was never
+        /// activated is closed for a new one; without such a session, the new one gets
+        /// BadTooManySessions.
         #[schemars(range(min = 1, max = 10000))]
         sessions: u16,
-        /// Sessions of one client address, which binds only while less than an eighth of the sessions is free; default half of
-        /// the sessions. SCADA hosts and gateways run many clients on one address.
+        /// Sessions of a client address, enforced only while less than an eighth of the sessions is
+        /// free; default half of the sessions. SCADA hosts and gateways run many clients on an
+        /// address.
         #[schemars(range(min = 1, max = 10000))]
         sessions_per_address: u16,
-        /// Connections; default four times the sessions and 100 more. The oldest one without an activated session gives way.
+        /// Connections; default four times the sessions and 100 more. At the limit, the oldest
+        /// connection without an activated session is closed.
         #[schemars(range(min = 1, max = 65535))]
         connections: u16,
-        /// Connections of one client address; default twice the sessions and 50 more.
+        /// Connections of a client address; default twice the sessions and 50 more.
         #[schemars(range(min = 1, max = 65535))]
         connections_per_address: u16,
         /// Subscriptions of a session; default 50.
@@ -216,168 +229,187 @@ document! {
         /// Monitored items of a subscription; default 10000.
         #[schemars(range(min = 1, max = 65535))]
         items: u16,
-        /// Nodes that one request reads or writes, or items that it makes; default 10000 and 1000.
+        /// Nodes that a request reads or writes, or monitored items that it creates; default 10000
+        /// and 1000.
         #[schemars(range(min = 1, max = 65535))]
         operations: u16,
     }
 
-    /// One value of the cell.
+    /// A value of the cell.
     struct VariableEntry {
-        /// The OPC UA node, as ns=2;i=10.
+        /// The OPC UA node, such as ns=2;i=10.
         #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         node: String,
-        /// Name of the node; dots part the folders it stands in, as Line.Conveyor.Speed.
+        /// Name of the node; dots separate its folders, such as Line.Conveyor.Speed.
         #[schemars(required, length(min = 1, max = 512))]
         name: String,
-        /// OPC UA builtin type, as Boolean or Double[]. May be left out where a ROS type says it.
+        /// OPC UA builtin type, such as Boolean or Double[]. Default: the type of the bound ROS
+        /// field.
         r#type: String,
-        /// Of a publisher that is none of the bridges and sends several fields in the DataSetMessages of this value: the one
-        /// that is the value, by its place from 0 or by its name in the DataSetMetaData that the publisher announces. Left out:
-        /// the only field, or the one that is announced under the `name` of this variable.
+        /// For a publisher that is not a bridge and sends several fields in the DataSetMessages of
+        /// this value: the field of the value, by its index from 0 or by its name in the
+        /// DataSetMetaData of the publisher. Default: the only field, or the field with the `name`
+        /// of this variable.
         ua_field: UaFieldEntry,
-        /// What the value is, for people: the Description of the node. Left out: the name of its topic.
+        /// Text for users: the Description of the node. Default: the name of its topic.
         #[schemars(length(min = 1, max = 1000))]
         description: String,
-        /// How many digits behind the decimal point are worth showing (ValuePrecision), of a value that is a number.
+        /// Number of decimal places to show (ValuePrecision), for a number.
         #[schemars(range(max = 15))]
         precision: u16,
-        /// Unit of the value in OPC UA, by its symbol as m/s, its UNECE code as MTS, or its name.
+        /// Unit of the value in OPC UA: a symbol such as m/s, a UNECE code such as MTS, or a name.
         unit: String,
-        /// Lowest and highest value to be expected in OPC UA, as [0, 1.5].
+        /// Lowest and highest expected value in OPC UA, such as [0, 1.5].
         range: Vec<At<f64>>,
-        /// What the numbers of the value mean, as {0: idle, 1: moving}.
+        /// Texts for the numbers of the value, such as {0: idle, 1: moving}.
         #[schemars(with = "Option<BTreeMap<String, String>>")]
         r#enum: EnumTexts,
-        /// The space that produces the value: 0 the OPC UA side, else one of `spaces`.
+        /// The space that produces the value: 0 for the OPC UA side, otherwise an id of `spaces`.
         #[schemars(required, range(max = 232))]
         origin: u16,
-        /// Stands for the identifier in topic names when the node id is no number from 1 to 65535 or in namespace
-        /// 0. In the topic names of nodes of namespace 0 the namespace is 65535.
+        /// Replaces the identifier in topic names if the node id is not a number from 1 to 65535,
+        /// or is in namespace 0. In the topic names of nodes of namespace 0 the namespace is 65535.
         #[schemars(range(min = 1, max = 65535))]
         alias: u16,
-        /// The ROS topics and services tied to the value, one or a list, at most one per space. In the space of its origin
-        /// the topic is read, elsewhere it is written. Without any, the topic is named after the space: /ua_1_2_10.
+        /// The ROS topics and services of the value, a single binding or a list, at most one per
+        /// space. The topic is read in the space of its origin and written elsewhere. Default: a
+        /// topic with the name of the space, such as /ua_1_2_10.
         ros: Bindings,
-        /// With `origin: 0`: the node of another OPC UA server that the value comes from. The cell's server hears of each change,
-        /// and shows and sends it with the time and the quality it has there; while that server is away it is bad.
+        /// With `origin: 0`: the node of another OPC UA server that the value comes from. The
+        /// server of the cell receives each change and passes it on with its time and quality;
+        /// while the other server is lost, the value is bad.
         from: FromEntry,
-        /// The node of another OPC UA server that each value is written to, be it of this space or of another.
+        /// The node of another OPC UA server that each value is written to, from this space or
+        /// another.
         to: ToEntry,
-        /// `keep_latest` for a state: the newest value counts and ROS subscribers that come late get it. `{drop_oldest: 100}`
-        /// for events: each value is delivered once, to the subscribers that are present. Left out: an event for values of
-        /// origin 0 and values that call a service; others are what their ROS publisher is, a state where it is latched or
-        /// transient-local and an event otherwise.
+        /// `keep_latest` for a state: only the newest value matters, and late ROS subscribers
+        /// receive it. `{drop_oldest: 100}` for events: each value is delivered once, to present
+        /// subscribers. Default: an event for values of origin 0 and values that call a service;
+        /// otherwise a state if the ROS publisher is latched or transient-local, and an event if
+        /// not.
         queue: Queue,
-        /// What is published once into ROS, or requested of the service that the value calls, when the commander of the value has
-        /// ended or timed out, if a value of it was published since: `zero`, the value of the bound `field`, fields of the
-        /// message or request as {linear.x: 0.1}, or {call: ns=2;i=48} for the service that the values of that variable call.
+        /// Published once into ROS, or sent to the service that the value calls, when the commander
+        /// of the value has stopped or timed out after it published a value: `zero`, a value of the
+        /// bound `field`, fields of the message or request such as {linear.x: 0.1}, or {call:
+        /// ns=2;i=48} for the service of that variable.
         on_loss: OnLossEntry,
-        /// With `on_loss`: a value that is not renewed for this long is lost, too, as 500ms.
+        /// With `on_loss`: the value is also lost if it is not renewed within this time, such as
+        /// 500ms.
         #[schemars(regex(pattern = DURATION))]
         hold: String,
-        /// Which values its origin sends: `always` (the default) each, `on_change` those that differ from the last one sent.
+        /// Values that the origin sends: `always` (the default) every value, `on_change` only
+        /// values that differ from the last sent value.
         publish: PublishEntry,
-        /// As `publish: on_change`, and numbers (each of an array) have to differ by more than this.
+        /// As `publish: on_change`, but numbers (each element of an array) must differ by more than
+        /// this.
         deadband: f64,
-        /// Highest rate at which its origin sends it, as 10 Hz: of values that come faster the newest follows when the time
-        /// is over.
+        /// Highest rate at which the origin sends the value, such as 10 Hz: of faster values, the
+        /// newest is sent after the period.
         #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)? ?Hz$"))]
         at_most: String,
-        /// When the server no longer shows the value as good, because no newer one comes.
+        /// Age limits after which the server no longer shows the value as good.
         quality: QualityEntry,
-        /// Which values are an alarm at the server, as {high: 70, high_high: 90} or {normal:
+        /// Values that raise an alarm at the server, such as {high: 70, high_high: 90} or {normal:
         /// false}.
         alarm: AlarmEntry,
         /// `alarms`, with `origin: 0`: the value is a diagnostic_msgs/DiagnosticArray that the
         /// server makes of its conditions, once a second and when one changes. Diagnostics of
         /// robots are not in it.
         reports: ReportsEntry,
-        /// What says that a value has arrived. `bridge`, the default for events of origin 0 and for values that call a service:
-        /// each bridge that the mapping ties the value to, when a present subscriber or the service has it; the value is sent
-        /// again until then, 1 s at most, and a client's write is answered accordingly. `none`: a write is answered when the
-        /// value has been sent. {within: 2s} for another time; {by: ns=2;i=31} with `origin: 0` for a value that the robot
-        /// answers with.
+        /// Confirmation that a value has arrived. `bridge`, the default for events of origin 0 and
+        /// for values that call a service: each bridge with a binding of the value confirms when a
+        /// present subscriber or the service has received it; the value is sent again until then,
+        /// for 1 s at most, and the result of a write states the outcome. `none`: a write succeeds
+        /// when the value has been sent. {within: 2s} for another time; {by: ns=2;i=31} with
+        /// `origin: 0` for a variable that the robot sends as confirmation.
         confirm: ConfirmedEntry,
-        /// How many past values the server keeps, 0 to 65535. Left out: as many as `server.history` says.
+        /// Number of past values that the server keeps, 0 to 65535. Default: as in
+        /// `server.history`.
         history: u16,
-        /// Which roles may do what with the node.
+        /// Permissions of roles for the node.
         permissions: PermissionsEntry,
     }
 
-    /// When the server no longer shows a value as good, because no newer one comes.
+    /// Age limits after which the server no longer shows a value as good.
     struct QualityEntry {
-        /// A value that no newer one follows for this long is uncertain (UncertainLastUsableValue), even while its writer is
-        /// heard: for values that come regularly. Left out: a value may be of any age as long as its writer is heard.
+        /// A value is uncertain (UncertainLastUsableValue) after this time without a newer value,
+        /// even while messages of its writer are received: for periodic values. Default: no age
+        /// limit while messages of its writer are received.
         #[schemars(regex(pattern = DURATION))]
         uncertain_after: String,
-        /// A value that has been uncertain for this long, for its age or because its writer is silent, is bad
-        /// (BadNoCommunication) and is not shown. Left out: as `server.bad_after` says.
+        /// A value becomes bad (BadNoCommunication) and is not shown after being uncertain for this
+        /// time, because of its age or the loss of its writer. Default: as in `server.bad_after`.
         #[schemars(regex(pattern = DURATION))]
         bad_after: String,
     }
 
     /// A service that stops the robot.
     struct StopCallEntry {
-        /// Node of the variable whose values call it with the same request each time, as ns=2;i=48.
+        /// Node of the variable whose values call it with a fixed request, such as ns=2;i=48.
         #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         call: String,
     }
 
-    /// What says that a value has arrived. With `by`, a write without an answer in time is BadTimeout, the variable shows what
-    /// it showed before, and the value is not repeated to who comes later.
+    /// Confirmation that a value has arrived. With `by`, a write without a confirmation in time
+    /// returns BadTimeout, the variable shows its previous value, and the value is not sent to late
+    /// subscribers.
     struct ConfirmEntry {
-        /// Node of the variable that answers, as ns=2;i=31: one of another space, or one that comes `from` a server. The
-        /// answer is sent anew for each write. Left out: the bridges confirm.
+        /// Node of the variable that confirms, such as ns=2;i=31: a variable of another space, or
+        /// with `from`. It is sent again for each write. Default: the bridges confirm.
         #[schemars(regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         by: String,
-        /// How long the answer may take; default 2s, and 1s for that of the bridges.
+        /// Time limit of the confirmation; default 2s, and 1s for confirmations of the bridges.
         #[schemars(regex(pattern = DURATION))]
         within: String,
-        /// Which answer counts: `same` (the default) one that equals what was written, `any` each that comes after it.
+        /// The value that confirms: `same` (the default) a value that equals the written value,
+        /// `any` every later value.
         when: ConfirmWhenEntry,
-        /// In place of `when`: the answer that counts, as true, 3 or done.
+        /// Instead of `when`: the value that confirms, such as true, 3 or done.
         equals: String,
     }
 
-    /// Which roles may do what with a variable.
+    /// Permissions of roles for a variable.
     struct PermissionsEntry {
-        /// Who may read it, one role or a list; default everybody.
+        /// Roles that may read it, a single role or a list; default every user.
         read: RoleList,
-        /// Who may write it, with `origin: 0`; default [operator, engineer].
+        /// Roles that may write it, with `origin: 0`; default [operator, engineer].
         write: RoleList,
     }
 
-    /// Which roles may do what with a call.
+    /// Permissions of roles for a call.
     struct CallPermissionsEntry {
-        /// Who may call the Method, one role or a list; default [operator, engineer].
+        /// Roles that may call the Method, a single role or a list; default [operator, engineer].
         call: RoleList,
     }
 
-    /// ROS topics that become values as they appear.
+    /// ROS topics that become values when they appear.
     struct PatternEntry {
-        /// The topics, as /robot*/joint_states: `*` stands for one or more characters of a part between slashes, a part `**`
-        /// for any number of parts.
+        /// The topics, such as /robot*/joint_states: `*` matches one or more characters of a part
+        /// between slashes, a part `**` matches any number of parts.
         #[schemars(required, regex(pattern = r"^/.*\*"))]
         topics: String,
-        /// Topics left out, patterns too, as [/robot9/**].
+        /// Excluded topics or patterns, such as [/robot9/**].
         exclude: Vec<At<String>>,
         /// The ROS space of the topics.
         #[schemars(required, range(min = 1, max = 1))]
         origin: u16,
-        /// The OPC UA node of each, as ns=2;i=10{1}: {1} is what the first wildcard stands for, {2} the second. A topic whose
-        /// number would not be one from 1 to 65535 is left out, with a word in the log.
+        /// The OPC UA node of each topic, such as ns=2;i=10{1}: {1} is the text that the first
+        /// wildcard matches, {2} the second. A topic without a number from 1 to 65535 is ignored
+        /// with a log message.
         #[schemars(required, regex(pattern = r"^ns=[0-9]+;[isgb]="))]
         node: String,
-        /// Name of the node, as Robot{1}Joints.
+        /// Name of the node, such as Robot{1}Joints.
         #[schemars(required, length(min = 1))]
         name: String,
-        /// Stands for the identifier in topic names when the node id is no number, as 10{1}.
+        /// Replaces the identifier in topic names if the node id is not a number, such as 10{1}.
         alias: String,
-        /// Message type, as sensor_msgs/JointState: topics of another type are left out. Left out: any.
+        /// Message type, such as sensor_msgs/JointState: topics of another type are ignored.
+        /// Default: any type.
         r#type: String,
-        /// The field that holds the value, or a part of it, as in a binding. Left out: the whole message, a field per leaf.
+        /// The field of the value, or a part of it, as in a binding. Default: the whole message, a
+        /// field per leaf.
         field: String,
-        /// Several fields of the message in place of `field`, as in a binding.
+        /// Several fields of the message instead of `field`, as in a binding.
         fields: FieldList,
         /// As in a binding.
         scale: f64,
@@ -387,148 +419,160 @@ document! {
         invert: bool,
         /// As in a binding.
         out_of_range: OutOfRangeEntry,
-        /// How the messages cross: `fields` (the default) as OPC UA values, `bytes` as they are, one ByteString each,
-        /// `structure` as one OPC UA structure each, as in a binding.
+        /// Form of the messages: `fields` (the default) as OPC UA values, `bytes` unchanged, one
+        /// ByteString each, `structure` as one OPC UA structure each, as in a binding.
         r#as: AsEntry,
     }
 
-    /// A ROS topic or service tied to a value: exactly one of `topic`, `call`, `answer` and `poll`.
+    /// A ROS topic or service of a value: exactly one of `topic`, `call`, `answer` and `poll`.
     struct BindingEntry {
-        /// Whose topic it is. Left out: the origin of the value.
+        /// Space of the topic or service. Default: the origin of the value.
         #[schemars(range(min = 1, max = 232))]
         space: u16,
-        /// Absolute topic name, as /conveyor/running.
+        /// Absolute topic name, such as /conveyor/running.
         #[schemars(regex(pattern = "^/"))]
         topic: String,
-        /// Absolute name of a ROS 1 service that is called with each value that arrives from another space: the value
-        /// stands in `field` of the request, or its fields in `fields`. Without either the request is the same each time,
-        /// and `when` says which values call.
+        /// Absolute name of a ROS 1 service that is called with each value from another space:
+        /// `field` of the request takes the value, or `fields` its fields. Without them the request
+        /// is fixed, and `when` selects the values that call.
         #[schemars(regex(pattern = "^/"))]
         call: String,
-        /// Node of the variable with a `call`, as ns=2;i=20: the value is what that service answers to its calls, one field
-        /// of the response, several or all.
+        /// Node of the variable with a `call`, such as ns=2;i=20: the value is the response of this
+        /// service: a field of it, several fields or all.
         #[schemars(regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         answer: String,
-        /// Absolute name of a ROS 1 service that is called `every` so often with `request`: the value is what it answers,
-        /// one field of the response, several or all.
+        /// Absolute name of a ROS 1 service that is called with `request` in the period `every`:
+        /// the value is its response: a field of it, several fields or all.
         #[schemars(regex(pattern = "^/"))]
         poll: String,
-        /// Message type, as std_msgs/Bool. Left out: the std_msgs type of the variable's `type`. With `call` and `poll` the
-        /// service type, as std_srvs/SetBool, which is never left out.
+        /// Message type, such as std_msgs/Bool. Default: the std_msgs type for the `type` of the
+        /// variable. With `call` and `poll` the service type, such as std_srvs/SetBool, which is
+        /// required.
         r#type: String,
-        /// The field that holds the value, as data or pose.position.x. Left out: the whole message, a field per leaf. Of an
-        /// array that is read a part: an element as position[2], by the text at its place in another array of the message as
-        /// position[name=joint_3], several as ranges[0:90].
+        /// The field of the value, such as data or pose.position.x. Default: the whole message, a
+        /// field per leaf. A part of an array can be read: an element such as position[2], an
+        /// element by the text at its position in another array of the message, such as
+        /// position[name=joint_3], several elements such as ranges[0:90].
         field: String,
-        /// Several fields of the message in place of `field`, in this order, as [linear.x, angular.z]; one that is converted
-        /// as {field: linear.x, scale: 1000}. Where the message is written, they stand in the order it has them, and all others
-        /// are zero or empty.
+        /// Several fields of the message instead of `field`, in this order, such as [linear.x,
+        /// angular.z]; a converted field such as {field: linear.x, scale: 1000}. For a written
+        /// message they are in the order of the message, and all other fields are zero or empty.
         fields: FieldList,
-        /// The value in OPC UA is the field's times this, and `offset`; written to ROS the other way round.
+        /// Factor: the value in OPC UA is the value of the field times `scale` plus `offset`; the
+        /// inverse is written to ROS.
         scale: f64,
-        /// Added to the field's value for OPC UA, after `scale`; written to ROS it is taken off again.
+        /// Added to the value of the field for OPC UA, after `scale`; subtracted again for ROS.
         offset: f64,
-        /// The value in OPC UA is true where the field is false.
+        /// The value in OPC UA is true if the field is false.
         invert: bool,
-        /// Numbers that the type they become cannot hold: `refuse` (the default), they do not cross and are counted, or
-        /// `clamp`, they become the nearest it can hold. Needed where that can happen; integers are rounded to the nearest.
+        /// Numbers that do not fit the target type: `refuse` (the default) drops and counts them,
+        /// `clamp` replaces them by the nearest possible number. Required if this can happen;
+        /// integers are rounded to the nearest.
         out_of_range: OutOfRangeEntry,
-        /// With `call` and `poll`: fields of the request that stay the same, as {id: 12, pose: {x: 1.5}} or
-        /// {pose.x: 1.5}; the name of a constant of the request stands for its value. All others are zero or empty.
+        /// With `call` and `poll`: fixed fields of the request, such as {id: 12, pose: {x: 1.5}} or
+        /// {pose.x: 1.5}; the name of a constant of the request gives its value. All other fields
+        /// are zero or empty.
         request: Request,
-        /// With `call` and without `field` and `fields`: the value that calls the service. Default: true for a Boolean, any value else.
+        /// With `call` and without `field` and `fields`: the value that calls the service. Default:
+        /// true for a Boolean, every value for other types.
         #[schemars(extend("type" = ["string", "boolean", "number", "null"]))]
         when: String,
-        /// With `call` and `poll`: how long the service may take; default 5s.
+        /// With `call` and `poll`: time limit of the service; default 5s.
         #[schemars(regex(pattern = DURATION))]
         timeout: String,
-        /// With `poll`: how often the service is called; default 1s.
+        /// With `poll`: period of the calls; default 1s.
         #[schemars(regex(pattern = DURATION))]
         every: String,
-        /// How the message crosses: `fields` (the default) as OPC UA values, `bytes` as it is, one ByteString that only a
-        /// reader who knows the message type can read. For messages too big or too deep to be of use as values, as
-        /// images; not together with `field`. `structure`: as one OPC UA structure, which is described in the DataSetMetaData;
-        /// `field` may name a message in the message.
+        /// Form of the message: `fields` (the default) as OPC UA values; `bytes` unchanged, one
+        /// ByteString, for large or deeply nested messages such as images, which a reader can
+        /// decode only with the message type, and not together with `field`; `structure` as one OPC
+        /// UA structure, which the DataSetMetaData describe; `field` may then select a nested
+        /// message.
         r#as: AsEntry,
     }
 
-    /// Something that is executed in one space: a service or action of ROS, a Method of an OPC UA server, or what a component
-    /// executes.
+    /// A call that is executed in one space: a service or action of ROS, a Method of an OPC UA
+    /// server, or a call of a component.
     struct CallEntry {
-        /// The OPC UA Method, as ns=2;i=61. An action takes five numbers: its goal this one, its cancel, its result, its feedback
-        /// and its status the next four.
+        /// The OPC UA Method, such as ns=2;i=61. An action takes five numbers: this number for its
+        /// goal, the next four for its cancel, its result, its feedback and its status.
         #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         node: String,
-        /// Name of the Method; dots part the folders it stands in, as Conveyor.Switch.
+        /// Name of the Method; dots separate its folders, such as Conveyor.Switch.
         #[schemars(required, length(min = 1, max = 512))]
         name: String,
-        /// What it does, for people.
+        /// Description for users.
         about: String,
-        /// The space where it is executed: 0 the OPC UA side, else one of `spaces`.
+        /// The space that executes it: 0 for the OPC UA side, otherwise an id of `spaces`.
         #[schemars(required, range(max = 232))]
         origin: u16,
         /// As with a variable.
         #[schemars(range(min = 1, max = 65535))]
         alias: u16,
-        /// Services of ROS, or actions, one or a list, at most one per space. That of the origin executes the call; those of other
-        /// spaces are offered there and ask for it. A space without one has it under its name, as /ua_1_2_61.
+        /// ROS services or actions, a single binding or a list, at most one per space. The binding
+        /// of the origin executes the call; the bridge offers the bindings of other spaces there
+        /// and requests the call. In a space without a binding the call has its own name, such as
+        /// /ua_1_2_61.
         ros: CallBindings,
         /// With `origin: 0`: the Method of another OPC UA server that executes the call.
         opcua: MethodEntry,
-        /// Whether requests from other hosts are executed; left out, only those from a loopback address are, since nobody
-        /// knows who sends them.
+        /// Whether requests from other hosts are executed. Default: only requests from a loopback
+        /// address, because the sender of unsecured requests is unknown.
         open: bool,
-        /// How long the service or Method may take, and how long who asks waits; default 30s. Of an action it is the time until a
-        /// goal is accepted or refused.
+        /// Time limit of the service or Method, and of the caller; default 30s. For an action: the
+        /// time until a goal is accepted or rejected.
         #[schemars(regex(pattern = DURATION))]
         timeout: String,
-        /// Which roles may call the Method at the server of the cell.
+        /// Roles that may call the Method at the server of the cell.
         permissions: CallPermissionsEntry,
     }
 
-    /// A service or action of ROS that executes a call, or asks for it: exactly one of `service` and `action`.
+    /// A service or action of ROS that executes or requests a call: exactly one of `service` and
+    /// `action`.
     #[schemars(extend("oneOf" = [{ "required": ["service"] }, { "required": ["action"] }]))]
     struct CallBindingEntry {
-        /// Whose service or action it is. Left out: the origin of the call.
+        /// Space of the service or action. Default: the origin of the call.
         #[schemars(range(min = 1, max = 232))]
         space: u16,
-        /// Absolute name of the service, as /conveyor/switch.
+        /// Absolute name of the service, such as /conveyor/switch.
         #[schemars(regex(pattern = "^/"))]
         service: String,
-        /// Absolute name of the action, as /navigate_to_pose: in ROS 1 the name before /goal, /cancel and /result.
+        /// Absolute name of the action, such as /navigate_to_pose: in ROS 1 the name before /goal,
+        /// /cancel and /result.
         #[schemars(regex(pattern = "^/"))]
         action: String,
-        /// Type of the service or action, as std_srvs/SetBool.
+        /// Type of the service or action, such as std_srvs/SetBool.
         #[schemars(required)]
         r#type: String,
-        /// Of a service that asks: what the fields of the call's request are made of, as {id: 6, on: {field: data}}: a constant,
-        /// or a field of the request here. A message stands for all fields in it. What is not named is made of the field of the
-        /// same name.
+        /// For a requesting service: the sources of the fields of the call's request, such as {id:
+        /// 6, on: {field: data}}: a constant, or a field of the request here. A message includes
+        /// all its fields. Fields without an entry come from the field of the same name.
         request: FieldMapEntry,
-        /// Of a service that asks: what the fields of the response here are made of, as {success: true, message: {field: text}}: a
-        /// constant, or a field of the call's response.
+        /// For a requesting service: the sources of the fields of the response here, such as
+        /// {success: true, message: {field: text}}: a constant, or a field of the call's response.
         response: FieldMapEntry,
-        /// Of an action that asks: what the fields of the goal that is executed are made of, as `request`: constants, or fields of
-        /// the goal here.
+        /// For a requesting action: the sources of the fields of the executed goal, like `request`:
+        /// constants, or fields of the goal here.
         goal: FieldMapEntry,
-        /// Of an action that asks: what the fields of the feedback here are made of, as `response`: constants, or fields of the
-        /// feedback of the action that is executed.
+        /// For a requesting action: the sources of the fields of the feedback here, like
+        /// `response`: constants, or fields of the feedback of the executed action.
         feedback: FieldMapEntry,
-        /// Of an action that asks: what the fields of the result here are made of, as `response`: constants, or fields of the
-        /// result of the action that is executed.
+        /// For a requesting action: the sources of the fields of the result here, like `response`:
+        /// constants, or fields of the result of the executed action.
         result: FieldMapEntry,
     }
 
-    /// A Method of an OPC UA server: of one of `servers`, or of the one at an endpoint.
+    /// A Method of an OPC UA server: of one of `servers`, or of the server at an endpoint.
     #[schemars(extend("oneOf" = [{ "required": ["server"] }, { "required": ["endpoint"] }]))]
     struct MethodEntry {
         /// The server, by its `name` among `servers`.
         server: String,
-        /// The server, as opc.tcp://127.0.0.1:4841, for anonymous users.
+        /// The endpoint of the server, such as opc.tcp://127.0.0.1:4841, for anonymous users.
         #[schemars(regex(pattern = r"^opc\.tcp://"))]
         endpoint: String,
-        /// The Object that the Method is called on, as nsu=urn:plc;s=Line: its namespace by the URI, which holds when the server
-        /// numbers its namespaces anew, or by the index there, as ns=3;i=7.
+        /// The Object of the Method, such as nsu=urn:plc;s=Line: its namespace by the URI, which
+        /// stays valid if the indexes of the server change, or by the index there, such as
+        /// ns=3;i=7.
         #[schemars(required, regex(pattern = EXPANDED_NODE_ID))]
         object: String,
         /// The Method, likewise.
@@ -536,18 +580,18 @@ document! {
         method: String,
     }
 
-    /// One of several fields, with what converts it.
+    /// One of several fields, with its conversion.
     struct FieldEntry {
-        /// The field, as in a binding with one.
+        /// The field, as in a binding with a single field.
         #[schemars(required)]
         field: String,
-        /// As in a binding with one field.
+        /// As in a binding with a single field.
         scale: f64,
-        /// As in a binding with one field.
+        /// As in a binding with a single field.
         offset: f64,
-        /// As in a binding with one field.
+        /// As in a binding with a single field.
         invert: bool,
-        /// As in a binding with one field.
+        /// As in a binding with a single field.
         out_of_range: OutOfRangeEntry,
     }
 }
@@ -563,7 +607,7 @@ choice! {
     enum EncodingEntry {
         /// UADP, the binary mapping.
         Uadp = "uadp",
-        /// JSON, Verbose: plain for readers that know the metadata.
+        /// JSON, Verbose: plain values for readers that know the metadata.
         JsonVerbose = "json-verbose",
         /// JSON, Compact: every value has its type, defaults are left out.
         JsonCompact = "json-compact",
@@ -590,16 +634,16 @@ choice! {
     }
 
     enum ConfirmWhenEntry {
-        /// One that equals what was written.
+        /// A value that equals the written value.
         Same = "same",
-        /// Each that comes.
+        /// Every value.
         Any = "any",
     }
 
     enum PublishEntry {
         /// Each value.
         Always = "always",
-        /// Values that differ from the last one sent.
+        /// Values that differ from the last sent value.
         OnChange = "on_change",
     }
 
@@ -613,31 +657,31 @@ choice! {
     }
 
     enum OutOfRangeEntry {
-        /// The value does not cross.
+        /// The value is dropped.
         Refuse = "refuse",
         /// The nearest value that fits.
         Clamp = "clamp",
     }
 
     enum RoleEntry {
-        /// Sees what there is.
+        /// Reads values.
         Observer = "observer",
         /// Runs the cell.
         Operator = "operator",
-        /// Sets the cell up.
+        /// Configures the cell.
         Engineer = "engineer",
-        /// Says who may do what.
+        /// Manages users and permissions.
         SecurityAdmin = "security_admin",
     }
 
     enum AnonymousEntry {
-        /// They are not let in.
+        /// Anonymous users are refused.
         Off = "off",
-        /// They read.
+        /// Anonymous users read.
         Observer = "observer",
-        /// They read, write and call.
+        /// Anonymous users read, write and call.
         Operator = "operator",
-        /// They may all that engineers may.
+        /// Anonymous users have the permissions of engineers.
         Engineer = "engineer",
     }
 
@@ -1162,7 +1206,7 @@ impl JsonSchema for Bindings {
     }
 }
 
-/// What a queue does when it is full.
+/// Overflow policy of a queue.
 #[derive(Clone, Copy, Debug, JsonSchema)]
 #[schemars(rename_all = "snake_case")]
 pub(crate) enum Queue {

@@ -4,49 +4,57 @@ use crate::document::{DURATION, EXPANDED_NODE_ID, SecurityEntry};
 use crate::read::{At, document};
 
 document! {
-    /// An OPC UA server that exists already, such as that of a PLC. The cell's own server is its client.
+    /// An existing OPC UA server, such as the server of a PLC. The server of the cell is its
+    /// client.
     struct RemoteServerEntry {
-        /// What the mapping calls it: letters, digits, `_`, `-` and `.`.
+        /// Its name in the mapping: letters, digits, `_`, `-` and `.`.
         #[schemars(required, regex(pattern = r"^[A-Za-z0-9_.-]{1,64}$"))]
         name: String,
-        /// Where it is, as opc.tcp://192.168.0.10:4840.
+        /// Its endpoint, such as opc.tcp://192.168.0.10:4840.
         #[schemars(required, regex(pattern = r"^opc\.tcp://"))]
         endpoint: String,
-        /// Security policy of the session. Left out: the best that the server offers, which may be None; every other one is signed
-        /// and encrypted, or there is no session.
+        /// Security policy of the session. Default: the best policy of the server, which may be
+        /// None; with every other policy, messages are signed and encrypted.
         security: SecurityEntry,
-        /// User name. Left out: anonymous.
+        /// User name. Default: anonymous.
         #[schemars(length(min = 1, max = 256))]
         user: String,
-        /// The user's password, as ${PLC_PASSWORD:-}: the environment of ua-server has it, and not the file; other programs need none.
+        /// Password of the user, such as ${PLC_PASSWORD:-}: set in the environment of ua-server,
+        /// not in the file; other programs do not need it.
         password: String,
-        /// The namespace of `namespaces`, which nothing else is in, that its skills have in the space: ua-server shows them there and has
-        /// them run, as a component does its own. Left out: they are not looked for.
+        /// The namespace of `namespaces` for its skills in the space, used for nothing else:
+        /// ua-server shows the skills there and runs them like the skills of a component. Default:
+        /// its skills are not used.
         #[schemars(range(min = 1, max = 65_535))]
         skills: u16,
-        /// Whether these skills are run for other hosts too where the group is not secured; default false.
+        /// Whether other hosts can also run these skills if the group is not secured; default
+        /// false.
         open: bool,
     }
 
     /// Servers with skills that discovery finds. Each has a namespace of its own in the space.
     struct FindSkillsEntry {
-        /// Which, by their ApplicationUris; with `*` at its end one stands for all that begin so, as urn:vendor:*. 1 to 64.
+        /// The ApplicationUris of the servers; `*` at the end matches any characters, as in
+        /// urn:vendor:*. 1 to 64.
         #[schemars(required, length(min = 1, max = 64))]
         uris: Vec<At<String>>,
-        /// The first namespace for them. Those from here on are theirs, and nothing else is in them. One that `namespaces` gives an
-        /// ApplicationUri is kept for that server; the others are given out as servers are found.
+        /// The first of the namespaces that are reserved for their skills. A namespace with an
+        /// ApplicationUri in `namespaces` belongs to the server with this URI; the others are
+        /// assigned when servers are found.
         #[schemars(required, range(min = 2, max = 65_535))]
         first: u16,
-        /// How many servers have a place, 1 to 64; default 8. Those that are found beyond them are told in the log.
+        /// Maximum number of servers, 1 to 64; default 8. Further servers are logged.
         #[schemars(range(min = 1, max = 64))]
         most: u16,
-        /// Security policy of the sessions, which are those of an anonymous user. Left out: the best that each server offers, which may
-        /// be None.
+        /// Security policy of the sessions, which are anonymous. Default: the best policy of each
+        /// server, which may be None.
         security: SecurityEntry,
-        /// Whether these skills are run for other hosts too where the group is not secured; default false.
+        /// Whether other hosts can also run these skills if the group is not secured; default
+        /// false.
         open: bool,
-        /// Networks behind routers, as 10.77.0.0/16, whose servers are accepted too. Left out: only servers with addresses in the
-        /// subnets of the interface, since anyone on the network can announce any address.
+        /// Networks behind routers, such as 10.77.0.0/16, with servers that are also accepted.
+        /// Default: only servers with addresses in the subnets of the interface, because any host
+        /// can announce any address.
         networks: Vec<At<String>>,
     }
 
@@ -55,17 +63,19 @@ document! {
         /// The server, by its `name` among `servers`.
         #[schemars(required)]
         server: String,
-        /// The variable there, as nsu=urn:plc;s=Line.Speed: its namespace by the URI, which holds when the server numbers its
-        /// namespaces anew, or by the index there, as ns=3;i=7.
+        /// The variable there, such as nsu=urn:plc;s=Line.Speed: its namespace by the URI, which
+        /// stays valid if the indexes of the server change, or by the index there, such as
+        /// ns=3;i=7.
         #[schemars(required, regex(pattern = EXPANDED_NODE_ID))]
         node: String,
-        /// How often the server is to look whether it has changed; default 100ms. Servers may do so less often.
+        /// Sampling interval of the server; default 100ms. Servers may sample less often.
         #[schemars(regex(pattern = DURATION))]
         sampling: String,
-        /// How many changes the server keeps until it tells them, 1 to 1000; default 10. Of more the oldest go.
+        /// Number of changes that the server queues, 1 to 1000; default 10. If the queue is full,
+        /// the oldest are dropped.
         #[schemars(range(min = 1, max = 1000))]
         queue: u16,
-        /// Numbers have to differ by more than this to be told.
+        /// Numbers are reported only if they differ by more than this.
         deadband: f64,
     }
 

@@ -22,14 +22,14 @@ document! {
         /// (ExclusiveLevelAlarmType). `false`: it is at each limit that the value exceeds
         /// (NonExclusiveLevelAlarmType).
         exclusive: bool,
-        /// How far a value has to return behind a limit before the alarm leaves it; default 0.
+        /// Distance that a value has to return from a limit before the alarm ends; default 0.
         deadband: f64,
-        /// The alarm is active while the value is not this one, as false, 0 or a text of `enum`
-        /// (OffNormalAlarmType).
+        /// The alarm is active while the value differs from this value, such as false, 0 or a text
+        /// of `enum` (OffNormalAlarmType).
         #[schemars(extend("type" = ["string", "boolean", "number", "null"]))]
         normal: String,
-        /// The alarm is active while the value is this one, or one of a list, as [2, 3] or texts of
-        /// `enum` (DiscreteAlarmType).
+        /// The alarm is active while the value equals this value or a value of this list, such as
+        /// [2, 3] or texts of `enum` (DiscreteAlarmType).
         when: ValueList,
         /// `true`: each status of a diagnostic_msgs/DiagnosticArray is an alarm of its own, by its
         /// hardware_id and name, and active unless its level is OK (SystemDiagnosticAlarmType).
@@ -40,12 +40,11 @@ document! {
         severity: u16,
         /// Whether an acknowledged alarm has to be confirmed too; default false.
         confirm: bool,
-        /// How long the value has to be beyond a limit before the alarm is active, as 500ms. Left
-        /// out: it is active at once.
+        /// Time that the value has to be beyond a limit before the alarm is active, such as 500ms.
+        /// Default: it is active at once.
         #[schemars(regex(pattern = DURATION))]
         delay: String,
-        /// Text of the alarm while it is active. Left out: the name of the variable, its value and
-        /// the limit.
+        /// Text of the active alarm. Default: the name of the variable, its value and the limit.
         #[schemars(length(min = 1, max = 1000))]
         message: String,
     }

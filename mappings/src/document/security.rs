@@ -5,57 +5,62 @@ use crate::read::{At, choice, document};
 document! {
     /// A SecurityGroup of OPC UA PubSub: the programs that have its keys.
     struct GroupEntry {
-        /// Its SecurityGroupId, as cell.
+        /// Its SecurityGroupId, such as cell.
         #[schemars(required, length(min = 1, max = 128))]
         group: String,
-        /// What is done to what is sent, and demanded of what is heard: `sign-and-encrypt` (the default), `sign`, or `none`, by
-        /// which namespaces are left out that a group without `namespaces` would have.
+        /// Protection of sent messages, and required for received messages: `sign-and-encrypt` (the
+        /// default), `sign`, or `none`, which excludes namespaces from a group without
+        /// `namespaces`.
         mode: GroupModeEntry,
-        /// How long the keys for encryption are: `aes256` (the default) or `aes128`.
+        /// Length of the keys for encryption: `aes256` (the default) or `aes128`.
         policy: GroupPolicyEntry,
-        /// Where the keys come from: exactly one of `file`, `credential` and `sks`.
+        /// Source of the keys: exactly one of `file`, `credential` and `sks`.
         keys: KeysEntry,
-        /// The namespaces whose values, events and calls are the group's, as [2, 3]. Left out: all that no other group names,
-        /// and what belongs to none, as questions and announcements.
+        /// The namespaces with the values, events and calls of the group, such as [2, 3]. Default:
+        /// all namespaces that no other group lists, and messages without a namespace, such as
+        /// probes and announcements.
         namespaces: Vec<At<u16>>,
-        /// How it is told that a message was there before. Default: `sender`.
+        /// Detection of repeated messages (replay). Default: `sender`.
         replay: ReplayEntry,
     }
 
-    /// Where the keys of a group come from.
+    /// Source of the keys of a group.
     struct KeysEntry {
-        /// A JSON file with keys, relative to the mapping, that only its owner can read (chmod 600). `ua-space keys` makes one.
+        /// A JSON file with keys, relative to the mapping, that only its owner can read (chmod
+        /// 600). `ua-space keys` makes the file.
         #[schemars(length(min = 1))]
         file: String,
-        /// The name of such a file among the credentials that systemd hands to the program (LoadCredential=).
+        /// The name of such a file among the credentials that systemd gives to the program
+        /// (LoadCredential=).
         #[schemars(length(min = 1))]
         credential: String,
-        /// A Security Key Service, which hands keys out and replaces them from time to time.
+        /// A Security Key Service, which provides keys and renews them.
         sks: SksEntry,
     }
 
     /// A Security Key Service.
     struct SksEntry {
-        /// Where it is, as opc.tcp://sks.local:4840. Left out: the cell's own OPC UA server, `server.endpoint`, which then makes
-        /// the keys.
+        /// Its endpoint, such as opc.tcp://sks.local:4840. Default: the OPC UA server of the cell,
+        /// `server.endpoint`, which then makes the keys.
         #[schemars(regex(pattern = r"^opc\.tcp://"))]
         endpoint: String,
-        /// With the cell's own server: how long a key is used before the next one; default 1h.
+        /// With the server of the cell: lifetime of a key; default 1h.
         #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$"))]
         key_lifetime: String,
-        /// With the cell's own server: the ApplicationUris of the programs that get the keys, as they stand in their certificates;
-        /// `*` at the end stands for any characters. The cell's own server and bridges get them in any case.
+        /// With the server of the cell: the ApplicationUris, from the certificates, of the programs
+        /// that get the keys; `*` at the end matches any characters. The server and the bridges of
+        /// the cell always get the keys.
         members: Vec<At<String>>,
     }
 }
 
 choice! {
     enum GroupModeEntry {
-        /// Anybody can write and read.
+        /// Every program of the network can write and read.
         None = "none",
-        /// Anybody can read, members alone can write.
+        /// Every program of the network can read; only members can write.
         Sign = "sign",
-        /// Members alone can write and read.
+        /// Only members can write and read.
         SignAndEncrypt = "sign-and-encrypt",
     }
 
@@ -67,13 +72,14 @@ choice! {
     }
 
     enum ReplayEntry {
-        /// By a count for each run of a program, as the programs of this project send: they may restart at any time.
+        /// A counter for each run of a program, as the programs of this project send it: they may
+        /// restart at any time.
         Sender = "sender",
-        /// By a count for each PublisherId and WriterGroupId, as OPC 10000-14 has it: with publishers of other makers. Of a
-        /// program that restarts nothing is taken until there are other keys.
+        /// A counter for each PublisherId and WriterGroupId, as in OPC 10000-14: for publishers of
+        /// other vendors. Messages of a restarted program are dropped until the keys change.
         Publisher = "publisher",
-        /// As `publisher`, and those that do not count are taken, as open62541 up to 1.5.7. Their messages can be sent again
-        /// by anybody.
+        /// As `publisher`, and publishers without a counter are accepted, such as open62541 up to
+        /// 1.5.7. Any host can repeat their messages.
         Uncounted = "uncounted",
     }
 }
