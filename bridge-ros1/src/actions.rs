@@ -502,7 +502,7 @@ impl Drop for New {
 fn reject(goal: &ServerGoal, why: &str) {
     // A goal that was recalled in the meantime has already ended.
     if let Err(error) = goal.reject(why) {
-        tracing::debug!("a goal is not rejected: {error}");
+        tracing::debug!("cannot reject a goal: {error}");
     }
 }
 

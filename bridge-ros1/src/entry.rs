@@ -75,7 +75,7 @@ impl BridgeRos1 {
     fn node_options(&self) -> Result<NodeOptions, ArgumentError> {
         let mut options = NodeOptions::from_env(NODE_NAME);
         for word in options.apply_arguments(&self.words)? {
-            warn!(word, "not a word that ROS gives a meaning to: ignored");
+            warn!(word, "ignored an unknown ROS argument");
         }
         Ok(options)
     }

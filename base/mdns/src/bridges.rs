@@ -243,7 +243,7 @@ pub async fn heard_bridges(
                             bridges.push(heard);
                         }
                     } else {
-                        debug!(name = ?service.fullname, "an announcement that is none of a bridge");
+                        debug!(name = ?service.fullname, "ignored an announcement that is not from a bridge");
                     }
                 }
                 ServiceEvent::ServiceRemoved(_, fullname) => {

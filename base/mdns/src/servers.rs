@@ -174,7 +174,7 @@ impl Mdns {
             warn!(
                 name = ours.announcement.instance,
                 url = ours.announcement.url,
-                "a server cannot be announced on {}: it listens on no address there, or is of another host by name",
+                "cannot announce a server on {}: it does not listen on an address of this interface, or its host name belongs to another host",
                 self.interface
             );
             return;
@@ -306,7 +306,7 @@ impl Mdns {
             Ok(length) => self.left = goodbyes(self.packet.get(..length).unwrap_or_default()),
             // Opened again with the next announcement.
             Err(error) => {
-                debug!(%error, "goodbyes on {} are heard a second late", self.interface);
+                debug!(%error, "goodbyes on {} are received a second late", self.interface);
                 self.goodbyes = None;
             }
         }
@@ -314,11 +314,11 @@ impl Mdns {
 
     /// Opens the channel again, which the crate closes without notice for a slow receiver.
     async fn browse_again(&mut self) {
-        debug!("hearing on {} anew", self.interface);
+        debug!("receiving mDNS on {} again", self.interface);
         match self.daemon.browse(SERVICE) {
             Ok(events) => self.events = events,
             Err(error) => {
-                debug!(%error, "mDNS cannot be heard on {}", self.interface);
+                debug!(%error, "cannot receive mDNS on {}", self.interface);
                 tokio::time::sleep(ANNOUNCE_EVERY).await;
             }
         }
@@ -351,7 +351,7 @@ impl Mdns {
                 info!(
                     from = change.original,
                     to = change.new_name,
-                    "another host has that mDNS name"
+                    "another host uses the mDNS name: this server is announced with another name"
                 );
             }
         }
@@ -360,7 +360,7 @@ impl Mdns {
     fn register(&self, info: ServiceInfo) {
         // A full queue is emptied in a moment, and announcements are repeated.
         if let Err(error) = self.daemon.register(info) {
-            debug!(%error, "not announced this time");
+            debug!(%error, "cannot send an announcement");
         }
     }
 
@@ -449,12 +449,12 @@ impl Mdns {
         match is_elsewhere {
             true => info!(
                 ?name, addresses = ?all, interface = %self.interface, suppressed,
-                hint = "to accept servers there: --network, or server.find_skills.networks in the mapping",
+                hint = "to accept servers of this address, give --network, or set server.find_skills.networks in the mapping",
                 "ignored an announcement: its address is in no subnet of the interface"
             ),
             false => debug!(
                 ?name,
-                suppressed, "ignored an announcement that is none of a server"
+                suppressed, "ignored an announcement that is not from a server"
             ),
         }
     }
@@ -475,7 +475,12 @@ impl Mdns {
         while self.there.contains_key(&to) || self.ours.contains_key(&to) {
             to = renamed(&to);
         }
-        info!(from, to, theirs, "another server has that mDNS name");
+        info!(
+            from,
+            to,
+            theirs,
+            "another server uses the mDNS name: this server is announced with another name"
+        );
         ours.announcement.instance.clone_from(&to);
         drop(self.take_back(from));
         self.put(ours);
@@ -549,7 +554,7 @@ fn hear_goodbyes(interface: &Interface) -> Option<UdpSocket> {
     let socket = listen(interface);
     let why = socket.as_ref().err();
     if let Some(error) = why {
-        debug!(%error, "goodbyes on {interface} are heard a second late");
+        debug!(%error, "goodbyes on {interface} are received a second late");
     }
     socket.ok()
 }

@@ -308,7 +308,7 @@ impl Shared {
         let ticket = match state.goals.arrive(id) {
             Arrival::New(ticket) => ticket,
             refused @ (Arrival::Known | Arrival::Full) => {
-                debug!(action = self.action.name(), %id, ?refused, "a goal is rejected");
+                debug!(action = self.action.name(), %id, ?refused, "rejected a goal");
                 return None;
             }
         };
@@ -455,7 +455,7 @@ impl Shared {
             Ok(()) | Err(Refusal::Overflow | Refusal::NoReader) => {}
             Err(refusal @ (Refusal::TooLarge(_) | Refusal::Late | Refusal::Failed)) => {
                 let (action, why) = (self.action.name(), refusal.label());
-                debug!(action, why, "the status of its goals is not published");
+                debug!(action, why, "cannot publish the status of the goals");
             }
         }
     }

@@ -166,7 +166,7 @@ impl Teller {
 fn warn_of_double(name: &str) {
     warn!(
         node = name,
-        "another node of the domain has the same name; tools of ROS show them as one"
+        "another node of the domain has the same name, so ROS tools cannot distinguish them; rename this node with --node-name"
     );
 }
 

@@ -118,7 +118,7 @@ impl Shared {
                 events.write(event, None).is_ok()
             });
             if written != Ok(true) {
-                warn!("subscribers of /parameter_events were not told of a change");
+                warn!("cannot publish a parameter change on /parameter_events");
             }
         }
         Ok(answer)

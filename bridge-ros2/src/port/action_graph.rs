@@ -152,7 +152,7 @@ impl SentGoal for Goal {
                 action::GoalEvent::Feedback(body) => GoalEvent::Feedback(body),
                 action::GoalEvent::FeedbackDropped(count) => {
                     let goal = handle.id();
-                    debug!(%goal, count, "feedback gave way to newer one");
+                    debug!(%goal, count, "dropped feedback in favour of newer feedback");
                     continue;
                 }
                 action::GoalEvent::Overdue(limit) => GoalEvent::Overdue(format!(
@@ -233,7 +233,7 @@ impl NewGoal for New {
 
     fn reject(self, why: &str) {
         // Clients receive the rejection without its reason.
-        debug!(goal = %self.0.id(), why, "a goal is rejected");
+        debug!(goal = %self.0.id(), why, "rejected a goal");
         self.0.reject();
     }
 }

@@ -189,7 +189,7 @@ impl Ros2Port {
         let Some(client) = opened else {
             return;
         };
-        debug!(message_type = %name, service = service.name, "asking what the type is");
+        debug!(message_type = %name, service = service.name, "requesting the description of a type");
         let request = type_description::request(name, *hash);
         let asked = service.name.clone();
         let calls = &mut self.descriptions.calls;
@@ -216,7 +216,7 @@ impl Ros2Port {
                 },
                 Err(why) => (inquiry.failed(now), why),
             };
-            debug!(message_type = %wanted.0, service, ?outcome, why, "asked what the type is");
+            debug!(message_type = %wanted.0, service, ?outcome, why, "received the response to a type description request");
             self.tell_untold(&wanted, outcome, &format!("{service}: {why}"));
             self.descriptions.asked.insert(wanted, inquiry);
         }
@@ -232,7 +232,7 @@ impl Ros2Port {
         let from = format!("type description of {service}");
         let added = self.definitions.add_described(name, types, *hash, &from);
         added.map_err(|error| error.to_string())?;
-        info!(message_type = %name, %hash, service, "the type was told by a node that uses it");
+        info!(message_type = %name, %hash, service, "received the description of the type from a node that uses it");
         Ok(())
     }
 
@@ -246,10 +246,10 @@ impl Ros2Port {
             warn!(
                 message_type = %name,
                 definition = %from,
-                "another node's type has the hash {hash}, ours {ours}: it may be misread, or not at all; {why}"
+                "another node uses the type with the hash {hash}, this bridge with {ours}: messages may be misread or dropped; {why}"
             );
         } else {
-            warn!(message_type = %name, %hash, "the type is not told by those who use it: {why}");
+            warn!(message_type = %name, %hash, "cannot get the type from the nodes that use it: {why}");
         }
     }
 }

@@ -111,7 +111,7 @@ impl Ros2Port {
         } else {
             warn!(
                 endpoints = made,
-                "readers and writers of ours were not announced by the DDS stack; made anew"
+                "the DDS stack did not announce readers and writers of this bridge; created them again"
             );
         }
     }
@@ -395,7 +395,7 @@ impl Ros2Port {
         info!(
             topic = source.dds_topic,
             message_type = %source.message_type,
-            "its publishers have another definition of the type now"
+            "the publishers use another definition of the type now"
         );
     }
 
@@ -470,7 +470,7 @@ impl Ros2Port {
             debug!(
                 topic,
                 ?requested,
-                "subscribed anew, as its publishers changed"
+                "subscribed again because the publishers changed"
             );
         }
     }

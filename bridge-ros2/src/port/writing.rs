@@ -126,7 +126,7 @@ impl Ros2Port {
         if let Some(dds_topic) = self.advertise_anew(topic, now) {
             warn!(
                 topic = dds_topic,
-                "a subscriber does not acknowledge; advertised anew for the others"
+                "a subscriber does not acknowledge values; advertised the topic again for the other subscribers"
             );
         }
     }
@@ -136,7 +136,7 @@ impl Ros2Port {
         if let Some(dds_topic) = self.advertise_anew(topic, now) {
             info!(
                 topic = dds_topic,
-                "a subscriber asks for a deadline; advertised anew with it"
+                "advertised the topic again with the deadline that a subscriber requests"
             );
         } else if let Some(open) = self
             .sinks

@@ -578,7 +578,10 @@ impl Driver {
             }
             return;
         }
-        debug!(service = self.service.name, "a reply for nobody here");
+        debug!(
+            service = self.service.name,
+            "dropped a response to another client"
+        );
         self.ignored.fetch_add(1, Ordering::Relaxed);
     }
 

@@ -293,7 +293,7 @@ impl Driver {
             Err(why) => {
                 debug!(
                     service = self.service.name,
-                    why, "a sample that is no request"
+                    why, "dropped a sample that is not a request"
                 );
                 count(&self.counters.malformed);
             }
@@ -369,7 +369,11 @@ impl Driver {
                 Some(reply) if now < reply.until => self.replies.push_back(reply),
                 Some(reply) => {
                     let client = reply.to.client();
-                    debug!(service = self.service.name, ?client, "a reply nobody takes");
+                    debug!(
+                        service = self.service.name,
+                        ?client,
+                        "a response without a recipient"
+                    );
                     count(&self.counters.undelivered);
                 }
                 None => {}

@@ -98,8 +98,8 @@ impl Gds {
         if let Some(suppressed) = self.another(&format!("hosts {number}")) {
             warn!(
                 application = ?record.uri, number, ?hosts, suppressed,
-                "a request for a certificate waits, because no administrator has confirmed these hosts: \
-                 `ua-gds approve {number}` or `ua-gds reject {number}`"
+                "a certificate request waits, because no administrator has confirmed these \
+                 hosts: `ua-gds approve {number}` or `ua-gds reject {number}`"
             );
         }
     }

@@ -327,7 +327,7 @@ impl Gds {
         if let Some(suppressed) = self.another(&format!("waits {number}")) {
             info!(
                 application = ?record.uri, number, %key, suppressed,
-                "a request for a certificate waits: `ua-gds approve {number}` or `ua-gds reject {number}`"
+                "a certificate request waits: `ua-gds approve {number}` or `ua-gds reject {number}`"
             );
         }
         Ok(number)
@@ -382,7 +382,7 @@ impl Gds {
         let kept = kept::change(&path, |all: &mut Requests| all.put(wanted, now()));
         kept.map_err(|error| unkept(&error))?.map_err(|full| {
             if let Some(suppressed) = self.another("full") {
-                warn!(suppressed, "refused a request for a certificate: {full}");
+                warn!(suppressed, "refused a certificate request: {full}");
             }
             StatusCode::BadTooManyOperations.into()
         })
@@ -433,7 +433,7 @@ impl Gds {
         let issued = issued.map_err(|fault| refused(&fault))?;
         info!(
             application = ?request.application_uri(), name = ?issued.name(), hosts = ?issued.hosts(), serial = %issued.serial(), by = ?by,
-            "a certificate is issued"
+            "issued a certificate"
         );
         Ok(issued)
     }
@@ -489,7 +489,7 @@ pub(crate) fn unfit(record: &Record, why: &str) -> Refusal {
 
 /// Logs that a list cannot be read or written, and returns the status for the caller.
 fn unkept(error: &io::Error) -> StatusCode {
-    warn!(%error, "the requests or invitations cannot be read or written");
+    warn!(%error, "cannot read or write the requests or invitations");
     StatusCode::BadResourceUnavailable
 }
 

@@ -64,7 +64,7 @@ pub(crate) async fn serve(
             () = &mut stop => break,
             _ = look.tick() => {
                 if let Err(fault) = server.gds.know(now()) {
-                    warn!("{fault}; whoever has the last revocation list goes on with that");
+                    warn!("{fault}; programs continue with the last revocation list");
                 }
                 server.look_at_certificates(&settings, &mut warned);
             }
@@ -126,7 +126,7 @@ impl Serving {
         let records = records.map_err(|error| io(error.to_string()))?;
         info!(
             authority = ?store.certificate().name(), applications = records.len(), url = server.url(),
-            "the global discovery server listens"
+            "the global discovery server is listening"
         );
         let gds = Arc::new(Gds {
             store: Mutex::new(store),
@@ -234,7 +234,7 @@ impl Serving {
         ];
         for (number, value) in values {
             if let Err(status) = self.server.show(&node(number), value) {
-                warn!(number, %status, "a node of the NodeSet cannot be shown");
+                warn!(number, %status, "cannot show a node of the NodeSet");
             }
         }
     }

@@ -199,7 +199,7 @@ impl TrustList for GroupList {
         let revoked = match lists {
             Ok(list) => vec![ByteString::from(list.der().to_vec())],
             Err(error) => {
-                warn!(%error, "there is no revocation list to hand out");
+                warn!(%error, "cannot read the revocation list");
                 Vec::new()
             }
         };

@@ -129,7 +129,7 @@ impl Face {
             });
             match self.method(&root, found, &mut objects, handler) {
                 // Methods that differ only in their namespaces: the first is shown.
-                Err(InstanceError::Taken(node)) => debug!(%node, "a method is not shown"),
+                Err(InstanceError::Taken(node)) => debug!(%node, "cannot show a method"),
                 made => made?,
             }
         }

@@ -86,7 +86,7 @@ async fn take(
 ) -> Result<(), ClientError> {
     let Some([takes, gives]) = signature(client, &method).await? else {
         mirror.kept_back += 1;
-        debug!(?path, "a method that is not passed on");
+        debug!(?path, "cannot pass on a method");
         return Ok(());
     };
     let name = path.last().map(String::as_str).unwrap_or_default();

@@ -404,7 +404,7 @@ fn configurable(
         let invalid = Refusal::Status(StatusCode::BadInvalidArgument);
         let told = Told::read(&request.arguments).ok_or_else(|| invalid.clone())?;
         let new: Place = told.place.parse().map_err(|_| invalid)?;
-        info!(place = %new, supervisor = told.supervisor_uri, "configured from above");
+        info!(place = %new, supervisor = told.supervisor_uri, "configured by the supervisor");
         server.show(&shown, told.place.as_str())?;
         server.show(&by, told.supervisor_uri.as_str())?;
         board.place(Some(told.place));

@@ -209,7 +209,7 @@ impl Tending {
                 connects: of.connects,
             });
             if let Err(error) = shown {
-                warn!(name = of.name, %error, "its methods are not shown");
+                warn!(name = of.name, %error, "cannot show the methods of a server");
             }
         }
         self.board.note(self.level, of.url, |peer| {

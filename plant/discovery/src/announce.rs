@@ -333,7 +333,7 @@ impl Telling {
             if let Some(unregister) = unregister
                 && let Err(error) = unregister.await
             {
-                debug!(%error, "the registration was not taken back");
+                debug!(%error, "cannot withdraw the registration");
             }
             if let Some(here) = self.here.take() {
                 here.leave().await;
@@ -414,7 +414,10 @@ impl Telling {
 
     /// Handles the loss of the embedded or external discovery server.
     fn gone(&mut self) {
-        debug!(lds = self.settings.lds, "the discovery server broke off");
+        debug!(
+            lds = self.settings.lds,
+            "the connection to the discovery server failed"
+        );
         let was_here = self.here.take().is_some();
         self.there = None;
         // A discovery server with too many clients may close the connection repeatedly.

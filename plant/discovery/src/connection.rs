@@ -132,7 +132,7 @@ where
                 let told = connection.conversation.tell(status, &why);
                 drop(timeout(WRITE_LIMIT, told).await);
             }
-            debug!(%peer, "a connection ends: {fault}");
+            debug!(%peer, "a connection ended: {fault}");
         }
     }
 }

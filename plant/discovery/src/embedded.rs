@@ -40,7 +40,7 @@ impl Embedding {
     /// Creates the certificate of the discovery server in advance, so that a takeover is fast.
     pub(crate) async fn prepare(self) {
         if let Err(error) = self.settings().prepare().await {
-            debug!(%error, "the certificate of the embedded discovery server is made later");
+            debug!(%error, "cannot make the certificate of the embedded discovery server yet");
         }
     }
 
@@ -85,7 +85,7 @@ impl Embedding {
                 .await;
             let counters = lds.counters().into_iter();
             let counted: Vec<_> = counters.filter(|(_, count)| *count > 0).collect();
-            info!(?counted, "the embedded discovery server has ended");
+            info!(?counted, "the embedded discovery server has stopped");
         });
         Ok(Embedded { ask, stop, task })
     }

@@ -20,14 +20,14 @@ pub(crate) async fn accept(listener: TcpListener, shared: Arc<Shared>) {
             // The process probably has no free file descriptor; connections may be closed by the
             // next attempt.
             Err(error) => {
-                debug!(%error, "a connection was not accepted");
+                debug!(%error, "cannot accept a connection");
                 tokio::time::sleep(ACCEPT_AGAIN).await;
                 continue;
             }
         };
         count(&shared.counters.connections);
         if let Err(error) = stream.set_nodelay(true) {
-            debug!(%error, %peer, "a connection that answers late");
+            debug!(%error, %peer, "a connection is slow to respond");
         }
         let of = Arc::clone(&shared);
         let task = tokio::spawn(async move { serve(stream, peer, &of).await });
@@ -57,7 +57,7 @@ impl Crowd {
                 .iter()
                 .position(|(from, _)| !has_share || *from == address);
             if let Some((from, task)) = oldest.and_then(|at| self.0.remove(at)) {
-                debug!(%from, "a connection gave way to another");
+                debug!(%from, "closed a connection in favour of a new connection");
                 task.abort();
                 gave_way = true;
             }

@@ -302,7 +302,7 @@ impl Keeper {
             info!(
                 url,
                 suppressed,
-                "cannot probe a server: its host name is not resolved here, or its URL is of another kind; it stays listed"
+                "cannot probe a server: its host name does not resolve on this host, or its URL is not opc.tcp; it stays listed"
             );
         }
         if let Outcome::Alive { start_time } = outcome {

@@ -50,7 +50,7 @@ impl Security {
             .map_err(|error| failed(&error))?;
         let (certificate, key) = pair(root);
         if trust_any {
-            warn!("every client certificate is trusted: for tests only");
+            warn!("this program trusts every client certificate: use this for tests only");
         }
         Ok(Self {
             certificate: CertificateStore::read_cert(&certificate)

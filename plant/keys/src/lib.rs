@@ -125,7 +125,7 @@ fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
     let runtime = match runtime {
         Ok(runtime) => runtime,
         Err(error) => {
-            warn!(%error, "keys cannot be fetched");
+            warn!(%error, "cannot fetch keys");
             return;
         }
     };

@@ -154,7 +154,7 @@ impl Door {
             changes: watch::Sender::new(0),
             refused: Mutex::new(LogLimit::every(TOLD_EVERY)),
         };
-        info!("those whom a trusted authority issued certificates are let in");
+        info!("accepting clients with certificates of trusted authorities");
         Ok(Some((
             Self {
                 shared: Arc::new(shared),
@@ -350,7 +350,7 @@ impl Shared {
         if *count == 0
             && let Err(error) = fs::write(&path, certificate.der())
         {
-            warn!(path = %path.display(), %error, "a client cannot be let in");
+            warn!(path = %path.display(), %error, "cannot admit a client");
             all.remove(&path);
             return Err(StatusCode::BadInternalError);
         }
@@ -405,7 +405,7 @@ impl Drop for Admitted<'_> {
         if *count == 0 {
             all.remove(&self.path);
             if let Err(error) = fs::remove_file(&self.path) {
-                warn!(path = %self.path.display(), %error, "the library goes on trusting a client that is gone");
+                warn!(path = %self.path.display(), %error, "cannot remove the certificate of a disconnected client from the temporary trust store: remove the file");
             }
         }
     }

@@ -205,7 +205,7 @@ impl Judge {
             warn!(
                 host, certificate = ?certificate.name(), hosts = ?certificate.hosts(),
                 application_uri = ?certificate.application_uri().unwrap_or_default(),
-                "the trusted certificate of the server names other hosts than the one it is reached at"
+                "the trusted certificate of the server does not include the host of its URL"
             );
         }
     }

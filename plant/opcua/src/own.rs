@@ -122,7 +122,7 @@ pub(crate) fn report(root: &Path, cause: &Cause) {
         return;
     };
     if let Err(error) = note(root, &certificate, cause) {
-        tracing::warn!(%error, "cannot note why the certificate was made");
+        tracing::warn!(%error, "cannot record why the certificate was made");
     }
     info!(
         name = ?certificate.name(), application_uri = ?certificate.application_uri().unwrap_or_default(),

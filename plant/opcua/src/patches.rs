@@ -65,7 +65,7 @@ pub fn check(addresses: &[SocketAddr]) -> Result<(), OtherHosts> {
         warn!(
             library = library(),
             hint = "build with `cargo xtask build`",
-            "OPC UA libraries do not bound what clients take"
+            "the OPC UA libraries of this build have no limits for clients"
         );
     });
     let is_allowed = std::env::var_os(SERVE_AS_PUBLISHED).is_some_and(|value| value == "1");

@@ -197,7 +197,7 @@ impl Pki {
         let key = CertificateStore::read_pkey(&self.root.join(OWN_KEY));
         let key = key.map_err(PkiError::Unreadable)?;
         self.make_own(data, Some(key), cause)?;
-        warn!("applications that trust the previous certificate have to trust the new one");
+        warn!("applications that trust the previous certificate must trust the new certificate");
         Ok(())
     }
 
@@ -222,7 +222,7 @@ impl Pki {
             path: certificate.clone(),
             source,
         })?;
-        warn!(aside = %aside.display(), "the previous certificate has no key, and is kept aside");
+        warn!(aside = %aside.display(), "the previous certificate has no key: moved it aside");
         self.make_own(data, None, &Cause::KeyMissing)
     }
 
@@ -368,7 +368,7 @@ pub fn know_trusted(root: &Path) {
             && !known.exists()
             && let Err(error) = fs::copy(&path, &known)
         {
-            warn!(path = %path.display(), %error, "a trusted certificate cannot be used");
+            warn!(path = %path.display(), %error, "cannot use a trusted certificate");
             continue;
         }
         let refused = root.join("rejected").join(&name);
@@ -391,15 +391,15 @@ fn check_own(certificate: &Path, key: &Path, application_uri: &str) -> Result<()
         warn!(
             certificate = %certificate.display(),
             application_uri,
-            "the certificate names another application: peers will refuse it; have one issued for this application (--gds), or \
-             `ua-server renew --self-made` and restart",
+            "the certificate has the ApplicationUri of another application, so peers will reject it; request one \
+             for this application (--gds), or run `ua-server renew --self-made` and restart",
         );
     }
     let now = opcua::types::DateTime::now().as_chrono();
     if own.is_time_valid(&now).is_err() {
         warn!(
             certificate = %certificate.display(),
-            "the certificate is not valid now (see `openssl x509 -noout -dates`): clients will refuse it",
+            "the certificate is not valid at this time (see `openssl x509 -noout -dates`): clients will reject it",
         );
     }
     Ok(())

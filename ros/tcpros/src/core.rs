@@ -399,7 +399,7 @@ async fn notify(shared: Arc<Shared>) {
         }
         while let Some(told) = calls.join_next().await {
             if let Ok(Err(error)) = told {
-                tracing::debug!(%error, "a node was not told of a change");
+                tracing::debug!(%error, "cannot notify a node of a change");
             }
         }
     }

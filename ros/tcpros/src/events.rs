@@ -16,7 +16,7 @@ pub(crate) fn master_awaited(uri: &str, error: &dyn Display) {
     warn!(
         ROS_MASTER_URI = uri,
         %error,
-        "waiting for the ROS master: start roscore there, or set ROS_MASTER_URI to where it runs"
+        "waiting for the ROS master: start roscore at this URI, or set ROS_MASTER_URI to the URI of the running master"
     );
 }
 
@@ -27,25 +27,25 @@ pub(crate) fn master_found(uri: &str) {
 pub(crate) fn master_restarted(uri: &str) {
     warn!(
         ROS_MASTER_URI = uri,
-        "the ROS master has restarted or forgotten this node: registering everything again"
+        "the ROS master has restarted or lost the registrations of this node: registering everything again"
     );
 }
 
 pub(crate) fn registration_refused(topic: &str, error: &dyn Display) {
-    warn!(topic, %error, "the ROS master did not take a registration: trying again");
+    warn!(topic, %error, "the ROS master refused a registration: trying again");
 }
 
 pub(crate) fn unregistration_failed(topic: &str, error: &dyn Display) {
-    warn!(topic, %error, "a registration stays behind in the ROS master: `rosnode cleanup` removes it");
+    warn!(topic, %error, "cannot unregister: remove the registration from the ROS master with `rosnode cleanup`");
 }
 
 pub(crate) fn parameter_failed(parameter: &str, error: &dyn Display) {
-    warn!(parameter, %error, "a parameter could not be read from the ROS master or set there: trying again");
+    warn!(parameter, %error, "cannot read or set a parameter at the ROS master: trying again");
 }
 
 pub(crate) fn time_source_changed(simulated: bool) {
     if simulated {
-        info!("/use_sim_time is true: the time is that of /clock");
+        info!("/use_sim_time is true: using the time of /clock");
     } else {
         info!("/use_sim_time is no longer true: the time is the wall clock's");
     }
@@ -54,7 +54,7 @@ pub(crate) fn time_source_changed(simulated: bool) {
 pub(crate) fn shutdown_incomplete(limit: Duration) {
     warn!(
         ?limit,
-        "not everything was withdrawn in time: `rosnode cleanup` removes what stays in the ROS master"
+        "cannot unregister everything in time: remove the remaining registrations from the ROS master with `rosnode cleanup`"
     );
 }
 
@@ -95,9 +95,9 @@ pub(crate) fn subscriber_joined(topic: &str, subscriber: &str, nodelay: bool) {
 
 pub(crate) fn subscriber_left(topic: &str, subscriber: &str, dropped: u64, why: &dyn Display) {
     if dropped > 0 {
-        warn!(topic, subscriber, dropped, %why, "a subscriber left that had lost messages by being slow");
+        warn!(topic, subscriber, dropped, %why, "a subscriber that lost messages because it was too slow disconnected");
     } else {
-        debug!(topic, subscriber, %why, "a subscriber left");
+        debug!(topic, subscriber, %why, "a subscriber disconnected");
     }
 }
 
@@ -105,7 +105,7 @@ pub(crate) fn message_too_long(topic: &str, bytes: usize) {
     tracing::error!(
         topic,
         bytes,
-        "a message longer than TCPROS can say was not published"
+        "cannot publish a message: it exceeds the length limit of TCPROS (4 GiB)"
     );
 }
 
@@ -147,7 +147,7 @@ pub(crate) fn link_waits(topic: &str, more: u64) {
     warn!(
         topic,
         more,
-        "a publisher waits to be connected to: so many are already, and RLIMIT_NOFILE allows for no more"
+        "cannot connect to a further publisher: the limit of connections is reached; raise the limit of open files (`LimitNOFILE=`, `ulimit -n`)"
     );
 }
 
@@ -188,7 +188,7 @@ impl Refusals {
     /// Waits briefly, so that a lack of file descriptors does not cause a busy loop.
     pub(crate) async fn accept_failed(&mut self, error: &std::io::Error) {
         if let Some(more) = self.accept.admit(clock::now()) {
-            warn!(server = self.server, %error, more, "a connection could not be accepted");
+            warn!(server = self.server, %error, more, "cannot accept a connection");
         }
         tokio::time::sleep(Duration::from_millis(100)).await;
     }
@@ -199,7 +199,7 @@ impl Refusals {
                 server = self.server,
                 limit,
                 more,
-                "a connection was refused: so many are open already, in all or from its address; RLIMIT_NOFILE decides how many may be"
+                "refused a connection: the limit of connections, in total or of this address, is reached; it follows from the limit of open files (`LimitNOFILE=`, `ulimit -n`)"
             );
         }
     }
@@ -211,14 +211,14 @@ impl Refusals {
                 server = self.server,
                 %address,
                 more,
-                "a connection that was idle was closed: too many are open"
+                "closed an idle connection: too many are open"
             );
         }
     }
 
     pub(crate) fn handshake_failed(&mut self, peer: &dyn Display, error: &dyn Display) {
         if let Some(more) = self.handshake.admit(clock::now()) {
-            warn!(server = self.server, %peer, %error, more, "a peer was turned away");
+            warn!(server = self.server, %peer, %error, more, "refused a peer");
         }
     }
 }

@@ -202,7 +202,7 @@ impl Registrar {
             Ok(listed) => listed,
             // The next check finds out whether the master is reachable.
             Err(error) => {
-                tracing::debug!(%error, "the registrations at the master were not read");
+                tracing::debug!(%error, "cannot read the registrations from the master");
                 return;
             }
         };

@@ -188,7 +188,7 @@ where
     H: Fn(Call) -> Response + Send + Sync + 'static,
 {
     if let Err(error) = stream.set_nodelay(true) {
-        tracing::debug!(%error, "an XML-RPC caller left at once");
+        tracing::debug!(%error, "an XML-RPC client disconnected at once");
         return;
     }
     let service = service_fn(move |request| answer(request, Arc::clone(&handler)));
@@ -200,7 +200,7 @@ where
         .serve_connection(TokioIo::new(stream), service)
         .await;
     if let Err(error) = served {
-        tracing::debug!(%error, "an XML-RPC caller was dropped");
+        tracing::debug!(%error, "dropped an XML-RPC client");
     }
 }
 

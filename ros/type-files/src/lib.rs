@@ -217,7 +217,7 @@ impl DefinitionTexts for TypeFiles {
         match read(path) {
             Ok(text) => Some(definition(text, path)),
             Err(error) => {
-                warn!(file = %path.display(), %error, "definition not readable");
+                warn!(file = %path.display(), %error, "cannot read a definition");
                 None
             }
         }

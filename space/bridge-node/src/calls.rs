@@ -276,7 +276,7 @@ impl<S: Send> Calls<S> {
             return;
         };
         if let State::Offered { server, .. } = known.state {
-            info!(%topic, "the call is gone: its service is withdrawn");
+            info!(%topic, "the program that executes the call withdrew it: its service is closed");
             if self.asked.values().any(|asked| asked.topic == topic) {
                 self.leaving.push((now, topic, server));
             }
@@ -448,7 +448,7 @@ impl<S: Send> Calls<S> {
             known.state = match offered {
                 Ok((service_type, server)) => {
                     let (service, service_type_name) = (&target.name, service_type.name());
-                    info!(%topic, service, service_type = %service_type_name, "offered as a service");
+                    info!(%topic, service, service_type = %service_type_name, "offered the call to ROS as a service");
                     left -= 1;
                     events.push(PortEvent::CallBound {
                         topic,

@@ -191,7 +191,7 @@ fn tell(noted: Noted) {
     match noted {
         Noted::Read { name, file } => info!(definition = %name, %file, "definition read"),
         Noted::Refused { name, file, error } => {
-            warn!(definition = %name, %file, "definition file does not count: {error}");
+            warn!(definition = %name, %file, "ignored a definition file: {error}");
         }
         Noted::Differs {
             name,

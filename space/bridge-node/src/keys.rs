@@ -142,9 +142,9 @@ pub(crate) fn give(router: &mut Router, group: &str, delivery: &KeyDelivery) {
             group,
             token = delivery.first_token_id,
             keys = delivery.keys.len(),
-            "keys of a secured group"
+            "received keys of a secured group"
         ),
-        Err(error) => warn!(group, %error, "keys of a secured group are not taken"),
+        Err(error) => warn!(group, %error, "rejected the keys of a secured group"),
     }
 }
 
@@ -179,7 +179,7 @@ async fn watch_file(
         Some(Err(failure)) => {
             warn!(
                 group = group.id,
-                "{failure}; nothing is said or heard in the group"
+                "{failure}; this program sends and receives nothing in the group"
             );
             return;
         }
@@ -215,7 +215,7 @@ fn read_again(path: &Path, group: &SecurityGroup) -> Option<KeyDelivery> {
     match file::read(path, group) {
         Ok(delivery) => Some(delivery),
         Err(failure) => {
-            warn!("{failure}; the keys there were stay in use");
+            warn!("{failure}; the previous keys stay in use");
             None
         }
     }

@@ -51,7 +51,7 @@ pub(crate) fn start(format: LogFormat, quiet: &str) {
         .with(Warnings.with_filter(LevelFilter::WARN.and(PerCallsite::default())))
         .try_init();
     if let Err(error) = started {
-        tracing::debug!(%error, "logging had been started before");
+        tracing::debug!(%error, "logging was already started");
     }
     if let Some(fault) = clock::fault(clock::now().utc) {
         tracing::warn!("{fault}");

@@ -363,7 +363,7 @@ impl MappingFile {
             };
             let Some(file) = self.file.clone() else {
                 if asked {
-                    info!("SIGHUP: there is no mapping to read again");
+                    info!("ignored SIGHUP: this program runs without a mapping");
                 }
                 continue;
             };
@@ -550,8 +550,8 @@ impl Reading {
         let left = before - findings.len();
         if left > 0 {
             info!(
-                "{left} bindings of {} are of types that are not built in; they are looked at when the definitions \
-                 are there (--check names them)",
+                "{left} bindings of {} use types that are not built in; they are checked \
+                 when their definitions are available (--check lists them)",
                 file.display()
             );
         }

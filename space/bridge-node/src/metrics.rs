@@ -166,7 +166,7 @@ async fn accept<T: Told>(listener: TcpListener, served: Served<T>) {
                 Ok(accepted) => accepted,
                 // The process is probably out of descriptors; others may be closed after the pause.
                 Err(error) => {
-                    debug!(%error, "a connection for metrics was not accepted");
+                    debug!(%error, "cannot accept a connection for metrics");
                     tokio::time::sleep(ACCEPT_AGAIN).await;
                     continue;
                 }
@@ -186,7 +186,7 @@ async fn accept<T: Told>(listener: TcpListener, served: Served<T>) {
             match in_time {
                 Ok(()) => {}
                 Err(_) if is_long.load(Ordering::Relaxed) => answered.await,
-                Err(_) => debug!("a connection for metrics was closed for its age"),
+                Err(_) => debug!("closed a connection for metrics after its time limit"),
             }
         });
         crowd.admit(Connection {
@@ -242,7 +242,7 @@ impl Crowd {
             .iter()
             .position(|open| open.is_long() == long && (!has_share || open.from == address));
         if let Some(open) = oldest.and_then(|at| self.open.remove(at)) {
-            debug!(from = %open.from, "a connection for metrics gave way to another");
+            debug!(from = %open.from, "closed a connection for metrics in favour of a new connection");
             open.task.abort();
         }
     }
@@ -266,7 +266,7 @@ async fn answer<T: Told>(stream: TcpStream, served: Served<T>, visit: Visit) {
         .serve_connection(TokioIo::new(stream), service)
         .await;
     if let Err(error) = served {
-        debug!(%error, "a connection for metrics broke off");
+        debug!(%error, "a connection for metrics failed");
     }
 }
 

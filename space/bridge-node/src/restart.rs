@@ -23,7 +23,7 @@ pub fn restart() {
     }
     if let Err(error) = kill_process(getpid(), Signal::TERM) {
         REQUESTED.store(false, Ordering::Relaxed);
-        warn!(%error, "the program cannot restart itself: restart it for its new certificate");
+        warn!(%error, "cannot restart this program: restart it by hand, so that it uses its new certificate");
     }
 }
 
@@ -35,7 +35,7 @@ pub(crate) fn is_requested() -> bool {
 /// Ends the program in order, as after SIGTERM.
 pub fn stop() {
     if let Err(error) = kill_process(getpid(), Signal::TERM) {
-        warn!(%error, "the program cannot stop itself");
+        warn!(%error, "cannot stop this program");
     }
 }
 
@@ -48,6 +48,6 @@ pub(crate) fn executed_again(ended: ExitCode) -> ExitCode {
     let name = arguments.next().unwrap_or_default();
     let program = env::current_exe().unwrap_or_else(|_| name.clone().into());
     let error = Command::new(&program).arg0(name).args(arguments).exec();
-    error!(%error, program = %program.display(), "the program cannot execute itself again");
+    error!(%error, program = %program.display(), "cannot start this program again");
     FailureKind::Io.into()
 }

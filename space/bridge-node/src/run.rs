@@ -141,7 +141,7 @@ impl<P: Port> Shell<P> {
         let status = self.status();
         let [topics, sent, delivered, dropped] = status.summary();
         info!(topics, sent, delivered, dropped, "ending");
-        debug!(status = %status.json(), "the last status");
+        debug!(status = %status.json(), "last status");
     }
 
     /// Runs the loop of one phase. All branches of the `select!` are cancel-safe: a socket, and
@@ -293,7 +293,9 @@ impl<P: Port> Shell<P> {
             None => {}
             Some(CarrierChange::Lost(why)) => {
                 let lost = group_lost(why);
-                warn!("{lost}; it is waited for, and nothing crosses meanwhile");
+                warn!(
+                    "{lost}; this program waits for the network and transfers nothing until then"
+                );
             }
             Some(CarrierChange::Back(interface)) => {
                 if let Some(source) = self.carrier.source() {
@@ -301,7 +303,7 @@ impl<P: Port> Shell<P> {
                 }
                 // The probes of the start may have been lost.
                 self.router.call_the_roll(now());
-                info!(%interface, "the PubSub network is within reach: hearing and sending there again");
+                info!(%interface, "the PubSub network is within reach again: sending and receiving");
             }
         }
         // A broker may have another limit after each connection.
@@ -430,7 +432,7 @@ impl<P: Port> Shell<P> {
                 }
                 Err(error) => {
                     let name = self.name_of(topic);
-                    warn!(%topic, %error, name, "the topic cannot cross");
+                    warn!(%topic, %error, name, "cannot bridge the topic");
                     // Values would be misread with the previous binding.
                     self.router.unbind(topic, now());
                 }

@@ -352,10 +352,12 @@ impl<'a> Session<'a> {
                     if let Some(id) = id {
                         self.unconfirmed.remove(&id);
                     }
-                    warn!("the broker does not take a message of this size");
+                    warn!(
+                        "cannot publish a message: the broker does not accept its size; raise the size limit of the broker"
+                    );
                 }
             }
-            Err(error) => warn!(?error, "cannot publish a message at the broker"),
+            Err(error) => warn!(?error, "cannot publish a message to the broker"),
         }
     }
 
@@ -420,7 +422,7 @@ impl<'a> Session<'a> {
                     self.timers.remove(&key(kind));
                 }
                 GenericEvent::NotifyError(error) => {
-                    debug!(?error, "a packet of the broker is not accepted");
+                    debug!(?error, "rejected a packet of the broker");
                 }
                 GenericEvent::RequestClose => {
                     let why = "the broker violated the protocol, or refused it";
@@ -471,7 +473,7 @@ impl<'a> Session<'a> {
             version: self.version,
             max_packet,
         };
-        info!(broker = %broker.address, version = ?self.version, "connected with the MQTT broker");
+        info!(broker = %broker.address, version = ?self.version, "connected to the MQTT broker");
     }
 
     /// Ends the session in order: the broker discards the will, and everything written arrives.

@@ -386,7 +386,7 @@ fn receiver(
         info!(
             wanted = options.receive_buffer,
             granted,
-            "the system grants a smaller receive buffer: raise net.core.rmem_max against lost bursts"
+            "the operating system grants a smaller receive buffer than wanted: bursts may be lost; raise net.core.rmem_max"
         );
     }
     UdpSocket::from_std(socket.into()).map_err(at("register the socket"))

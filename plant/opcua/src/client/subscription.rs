@@ -188,7 +188,7 @@ impl Queue {
             if 10_u64.pow(total.ilog10()) == total {
                 warn!(
                     total,
-                    "notices of a subscription are thrown away: nobody takes them"
+                    "dropped notifications of a subscription: the program does not process them"
                 );
             }
         }

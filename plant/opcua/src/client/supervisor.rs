@@ -364,7 +364,7 @@ async fn connect(
             if tell.try_send(happened).is_err() {
                 debug!(
                     ?happened,
-                    "nobody looks at the connection; it tells again a moment later"
+                    "the state of the connection is not read; it is reported again later"
                 );
             }
         };

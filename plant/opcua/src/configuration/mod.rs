@@ -210,7 +210,7 @@ impl Configuration {
         let answered = self.file.call(what, request)?;
         match what {
             FileMethod::CloseAndUpdate => {
-                info!(by = ?request.caller.user, "the trust list is another");
+                info!(by = ?request.caller.user, "the trust list was replaced");
                 // The first trusted authority takes effect after a restart of the server.
                 Ok(vec![Variant::Boolean(self.wants_door())])
             }
@@ -261,11 +261,11 @@ impl Configuration {
         let key = self.key_of(&certificate, given)?;
         self.store.judge(&certificate, issuers)?;
         self.store.keep_issuers(issuers).inspect_err(
-            |status| warn!(%status, "the authorities above a new certificate cannot be kept"),
+            |status| warn!(%status, "cannot store the issuers of the new certificate"),
         )?;
         info!(
             name = ?certificate.name(), issuer = ?certificate.issuer_name(), serial = %certificate.serial(), by = ?request.caller.user,
-            "there is a new certificate of the server, which waits for ApplyChanges"
+            "received a new certificate of the server; it is used after ApplyChanges"
         );
         self.state.lock().waiting = Some((certificate, key));
         Ok(vec![Variant::Boolean(true)])
@@ -299,7 +299,7 @@ impl Configuration {
     fn own_key(&self) -> Result<Vec<u8>, StatusCode> {
         let key = CertificateStore::read_pkey(&self.root.join(OWN_KEY));
         let key = key.map_err(|error| {
-            warn!(error, "the key of the server cannot be read");
+            warn!(error, "cannot read the key of the server");
             StatusCode::BadInternalError
         })?;
         let der = key.to_der().map_err(|_| StatusCode::BadInternalError)?;
@@ -313,7 +313,7 @@ impl Configuration {
         if let Some((certificate, key)) = waiting {
             let written = pair::write(&self.root, certificate.der(), key.as_deref());
             if let Err(error) = written {
-                warn!(%error, "the new certificate of the server cannot be written");
+                warn!(%error, "cannot write the new certificate of the server");
                 self.state.lock().waiting = Some((certificate, key));
                 return Err(StatusCode::BadResourceUnavailable.into());
             }
@@ -321,7 +321,7 @@ impl Configuration {
             self.state.lock().next_key = None;
         }
         if is_new || self.wants_door() {
-            info!(by = ?request.caller.user, "changes of certificates are applied: the server is started anew");
+            info!(by = ?request.caller.user, "applying changes of certificates: the server restarts");
             let this = Arc::clone(self);
             drop(tokio::spawn(async move {
                 tokio::time::sleep(ANSWER_LEAVES).await;
@@ -407,7 +407,7 @@ impl MethodHandler for CreateSigningRequest {
         if *is_anew {
             this.state.lock().next_key = Some(key);
         }
-        info!(is_anew, by = ?request.caller.user, "the server asks for a certificate");
+        info!(is_anew, by = ?request.caller.user, "the server requests a certificate");
         Ok(vec![Variant::ByteString(ByteString::from(
             made.der().to_vec(),
         ))])

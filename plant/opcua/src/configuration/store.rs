@@ -39,7 +39,7 @@ impl StoreList {
         let certificate = read(bytes)?;
         self.keep(&certificate, Standing::Trusted)
             .map_err(|error| told(&error))?;
-        info!(name = ?certificate.name(), by = ?request.caller.user, "a certificate is trusted");
+        info!(name = ?certificate.name(), by = ?request.caller.user, "added a certificate to the trust list");
         Ok(Vec::new())
     }
 
@@ -56,7 +56,7 @@ impl StoreList {
         };
         let wanted = thumbprint.as_ref().to_lowercase();
         let all = certificates::list(&self.root).map_err(|error| {
-            warn!(%error, "the certificate store cannot be read");
+            warn!(%error, "cannot read the certificate store");
             StatusCode::BadResourceUnavailable
         })?;
         let mut gone = all
@@ -68,7 +68,7 @@ impl StoreList {
         }
         for one in gone {
             fs::remove_file(&one.path).map_err(|error| told(&error))?;
-            info!(name = ?one.name, by = ?request.caller.user, "a certificate is trusted no longer");
+            info!(name = ?one.name, by = ?request.caller.user, "removed a certificate from the trust list");
         }
         Ok(Vec::new())
     }
@@ -128,7 +128,7 @@ impl StoreList {
             let known = known::read(&self.root);
             if !known.trusted.contains(certificate) {
                 self.keep(certificate, Standing::Trusted)?;
-                info!(name = ?certificate.name(), "a certificate of the trust list of the plant is trusted");
+                info!(name = ?certificate.name(), "added a certificate of the plant's trust list");
             }
         }
         Ok(())
@@ -191,7 +191,7 @@ impl StoreList {
                     return Err(StatusCode::BadCertificateIssuerRevocationUnknown);
                 }
                 Err(error) => {
-                    warn!(%error, "a revocation list cannot be kept");
+                    warn!(%error, "cannot store a revocation list");
                     return Err(StatusCode::BadResourceUnavailable);
                 }
             }
@@ -284,7 +284,7 @@ fn read(bytes: &ByteString) -> Result<Certificate, StatusCode> {
 
 /// Logs an error of the store, and returns the status code for the client.
 fn told(error: &io::Error) -> StatusCode {
-    warn!(%error, "the certificate store cannot be changed");
+    warn!(%error, "cannot change the certificate store");
     StatusCode::BadResourceUnavailable
 }
 

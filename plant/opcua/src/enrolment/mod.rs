@@ -370,7 +370,7 @@ impl Enrolment {
         kept.map_err(|status| format!("the trust list cannot be kept: {status}"))?;
         for list in &lists.revocation_lists {
             match known::put_crl(&self.root, list) {
-                Ok(Some(path)) => debug!(file = %path.display(), "kept a revocation list"),
+                Ok(Some(path)) => debug!(file = %path.display(), "stored a revocation list"),
                 Ok(None) => debug!(
                     issuer = ?list.issuer_name(),
                     "ignored a revocation list of an unknown authority"
@@ -411,7 +411,7 @@ impl Enrolment {
             .map_err(|error| format!("the certificate cannot be written: {error}"))?;
         info!(
             gds = self.gds.url,
-            "the program restarts with the certificate of the plant"
+            "restarting with the certificate of the plant"
         );
         Ok(())
     }

@@ -213,10 +213,10 @@ impl Access {
         *before = now;
         match Users::read(folder) {
             Ok(users) => {
-                info!(users = users.iter().count(), "the users are others now");
+                info!(users = users.iter().count(), "reloaded the users");
                 *self.users.write() = users;
             }
-            Err(error) => warn!("{error}; the users before stay"),
+            Err(error) => warn!("{error}; the previous users stay in use"),
         }
     }
 

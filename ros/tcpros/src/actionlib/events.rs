@@ -36,7 +36,7 @@ impl Faults {
         if let Some(more) = self.overrun.admit(clock::now()) {
             warn!(
                 topic,
-                lost, more, "messages of an action were lost: this process does not keep up"
+                lost, more, "messages of an action were lost: this process is too slow"
             );
         }
     }

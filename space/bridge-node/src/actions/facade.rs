@@ -139,7 +139,7 @@ async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
         result,
     } = follow(&asks, id, &goal, told).await;
     if let Err(why) = goal.end(status, &message, result.as_deref()) {
-        debug!(why, "the end of a goal cannot be told");
+        debug!(why, "cannot report the end of a goal");
     }
 }
 
@@ -150,13 +150,13 @@ async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
         return None;
     };
     if let Err(why) = send(asks, id, request).await {
-        debug!(why, "a goal of another space was not accepted");
+        debug!(why, "the goal from another space was not accepted");
         new.reject(&why);
         return None;
     }
     let accepted = new.accept().await;
     accepted
-        .inspect_err(|why| debug!(why, "a goal that was accepted goes on without its client"))
+        .inspect_err(|why| debug!(why, "an accepted goal continues without its client"))
         .ok()
 }
 
@@ -185,7 +185,7 @@ async fn follow(asks: &Asks, id: GoalId, goal: &impl ServedGoal, told: Told) -> 
 
 fn hand_to(goal: &impl ServedGoal, feedback: &[u8]) {
     if let Err(why) = goal.feedback(feedback) {
-        debug!(why, "feedback cannot be told");
+        debug!(why, "cannot publish feedback");
     }
 }
 
@@ -321,7 +321,7 @@ async fn cancel<C: CancelRequest>(asks: Asks, request: C) {
     if !agreed.await.unwrap_or(false) {
         request.reject();
     } else if let Err(why) = request.accept() {
-        debug!(why, "a goal that is being cancelled has ended here");
+        debug!(why, "ended a goal whose cancellation is in progress");
     }
 }
 

@@ -173,7 +173,7 @@ impl Facades {
         let mut events = Vec::new();
         for topic in over {
             if let Some(known) = self.forget(topic) {
-                info!(%topic, "the action is gone: its server is withdrawn");
+                info!(%topic, "the program that executes the action withdrew it: its action server is closed");
                 events.extend(known.unbind(topic));
             }
         }
@@ -378,7 +378,7 @@ impl Known {
         };
         let task = tasks.spawn(facade.run());
         let (action, action_type) = (&target.name, &type_name);
-        info!(%topic, action, %action_type, "offered as an action");
+        info!(%topic, action, %action_type, "offered the action to ROS");
         let call = |topic, service_type: &Arc<_>, map: &Arc<CallMap>| PortEvent::CallBound {
             topic,
             service_type: Arc::clone(service_type),

@@ -316,11 +316,11 @@ impl<C: ActionClient> Serving<C> {
 
     /// Has the client withdraw a goal. The end of the goal shows the effect.
     fn cancel_in_time(&mut self, id: GoalId) {
-        info!(action = %self.action.topic, goal = %Hex(id), "goal is withdrawn: it is cancelled as soon as it is accepted");
+        info!(action = %self.action.topic, goal = %Hex(id), "the goal was withdrawn before it was accepted; the bridge cancels it as soon as it is accepted");
         let client = Arc::clone(&self.client);
         self.tasks.spawn(async move {
             if let Err(fault) = client.cancel(CancelWhat::Goal(id)).await {
-                debug!(goal = %Hex(id), error = fault.text, "cannot cancel withdrawn goal yet");
+                debug!(goal = %Hex(id), error = fault.text, "cannot cancel the withdrawn goal yet");
             }
         });
     }
@@ -413,7 +413,7 @@ impl<C: ActionClient> Serving<C> {
     fn report_end(&self, id: GoalId, end: &str) {
         if self.goals.is_withdrawn(id) {
             let action = self.action.topic;
-            info!(%action, goal = %Hex(id), end, "withdrawn goal has ended");
+            info!(%action, goal = %Hex(id), end, "the withdrawn goal has ended");
         }
     }
 

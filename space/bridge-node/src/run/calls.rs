@@ -33,7 +33,7 @@ impl<P: Port> Shell<P> {
             } => {
                 let bound = self.router.bind_as(topic, (&message_type, note), now());
                 if let Err(error) = bound {
-                    warn!(%topic, %error, "the value of the action cannot cross");
+                    warn!(%topic, %error, "cannot bridge the value of the action");
                 }
             }
             PortEvent::CallBound {
@@ -69,14 +69,16 @@ impl<P: Port> Shell<P> {
         let service_type = service_type.name();
         match bound {
             Ok(()) => info!(%topic, %service_type, "call bound"),
-            Err(why) => warn!(%topic, %service_type, "cannot be asked for: {why}"),
+            Err(why) => warn!(%topic, %service_type, "the call is not available here: {why}"),
         }
     }
 
     fn offer_typed(&mut self, topic: TopicId, offered: &OfferedType) {
         let service_type = offered.service_type.name();
         match self.router.offer_type(topic, offered, now()) {
-            Ok(()) => info!(%topic, %service_type, name = offered.name, "executed for the space"),
+            Ok(()) => {
+                info!(%topic, %service_type, name = offered.name, "executing the calls of the space with this service")
+            }
             Err(why) => warn!(%topic, %service_type, "not executed for the space: {why}"),
         }
     }
@@ -114,13 +116,13 @@ impl<P: Port> Shell<P> {
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
-        debug!(%topic, name = description.name, "call offered by another program");
+        debug!(%topic, name = description.name, "another program offers a call");
         self.observe(|observer| observer.call_known(topic, description));
         self.port.call_known(topic, description);
     }
 
     fn call_gone(&mut self, topic: TopicId) {
-        debug!(%topic, "call withdrawn by its program");
+        debug!(%topic, "a program withdrew its call");
         self.observe(|observer| observer.call_gone(topic));
         self.port.call_gone(topic);
     }
@@ -158,7 +160,7 @@ impl<P: Port> Shell<P> {
                 self.taken.insert(namespace, why);
             }
             None => {
-                info!(namespace, "the namespace is free again: publishing in it");
+                info!(namespace, "the namespace is free: publishing in it");
                 self.taken.remove(&namespace);
             }
         }

@@ -159,7 +159,10 @@ impl<C: ServiceCall> Caller<C> {
             text
         });
         if result.is_ok() && std::mem::take(&mut self.failing) {
-            info!(service = self.client.service(), "the service answers again");
+            info!(
+                service = self.client.service(),
+                "the service responds again"
+            );
         }
         let outcome = Outcome {
             of: self.of,
