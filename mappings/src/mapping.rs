@@ -13,7 +13,7 @@ use crate::alarm::Alarm;
 use crate::broker::Broker;
 use crate::call::{Call, CallBinding};
 use crate::endpoint::Endpoint;
-use crate::loss::Loss;
+use crate::loss::{Loss, Motion};
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::permission::{Anonymous, Permissions};
@@ -706,6 +706,20 @@ impl Variable {
             ServiceRole::Answer { .. } => None,
         });
         topics.chain(service)
+    }
+
+    /// Returns whether its values may act where they arrive: they call a service, command a
+    /// movement, are confirmed, or have a reaction to the loss of their commander. Values whose
+    /// origin is the OPC UA side are commands too.
+    #[must_use]
+    pub fn is_command(&self) -> bool {
+        let calls = self.service.as_deref();
+        let calls = calls.is_some_and(|of| matches!(of.role, ServiceRole::Call { .. }));
+        let moves = |binding: &Binding| Motion::of(&binding.message_type).is_some();
+        calls
+            || self.bindings.iter().any(moves)
+            || self.loss.is_some()
+            || self.confirmed_within.is_some()
     }
 
     /// Returns the other spaces with topics or services that get its values.

@@ -143,7 +143,7 @@ fn asyncua_reads_what_topics_consist_of_and_structures_by_it() {
     // The UnitId encodes the characters of "MTS".
     assert_eq!(
         velocity,
-        &json!({"EngineeringUnits": [unit, 5_067_859, "m/s", "metre per second"], "EURange": [-1.0, 1.5], "RosTopics": ["1 /speed"]})
+        &json!({"EngineeringUnits": [unit, 5_067_859, "m/s", "metre per second"], "EURange": [-1.0, 1.5], "RosTopics": ["1 /speed"], "Command": true})
     );
     let mode = &of("ua_1_2_14")["fields"][0]["properties"];
     assert_eq!(

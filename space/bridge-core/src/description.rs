@@ -7,13 +7,14 @@
 //! name is missing if the fields do not form a message: a single value of a message, or values that
 //! were converted. The display name follows after the topic name: the name in the mapping, or the
 //! name from a local side with fields as payload, which may also add a description after `; `. The
-//! Property [`ROS_TOPICS`] of the first field lists the ROS topics of the mapping.
+//! Property [`ROS_TOPICS`] of the first field lists the ROS topics of the mapping, and the Property
+//! `Command` marks a value that acts where it arrives.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
-use mappings::{Binding, Meaning, TopicId, Unit, Variable};
+use mappings::{Binding, Meaning, SpaceId, TopicId, Unit, Variable};
 use messages::{Leaf, MemberKind, MessageType, Rank, Selected, Selection, TypeName};
 use uadp::discovery::{
     Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, DataTypeSchemaHeader,
@@ -264,6 +265,7 @@ impl Source<'_> {
         let mut topics_buffer = Vec::new();
         if let Some(variable) = self.variable {
             properties.extend(ros_topics(variable, &mut topics_buffer)?);
+            properties.extend(command(variable));
         }
         let fields: Vec<FieldMetaData<'_>> = self
             .leaves
@@ -575,6 +577,18 @@ fn ros_topics<'b>(
     Ok(Some(KeyValuePair { key, value }))
 }
 
+/// Returns the Property of a value of a ROS space that acts where it arrives. Values of the OPC UA
+/// side are commands by their origin.
+fn command(variable: &Variable) -> Option<KeyValuePair<'static>> {
+    let key = QualifiedName {
+        namespace: 0,
+        name: Some(COMMAND),
+    };
+    let value = Variant::Scalar(Scalar::Boolean(true));
+    let acts = variable.topic.space != SpaceId::UA && variable.is_command();
+    acts.then_some(KeyValuePair { key, value })
+}
+
 /// Returns the types of the messages in arrays and of the messages nested in them, without
 /// duplicates.
 fn structures<'m>(message_type: &'m MessageType, leaves: &[Leaf]) -> Vec<messages::Structure<'m>> {
@@ -712,6 +726,8 @@ const UNIX_2000: i128 = 946_684_800;
 /// The Property of the first field of a DataSet with the ROS topics and services of the value: an
 /// array of texts, each with the number of a space and a name, such as `1 /joint_states`.
 pub const ROS_TOPICS: &str = "RosTopics";
+/// The name of the Property of a value that acts where it arrives.
+const COMMAND: &str = "Command";
 /// The separator between the type and the description.
 const ABOUT: &str = "; ";
 /// The maximum accepted length in bytes of the description after the separator.

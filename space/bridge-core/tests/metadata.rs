@@ -506,7 +506,8 @@ fn a_mapped_topic_is_announced_with_its_name_and_its_ros_topics() {
             let properties = fields[index].properties.iter();
             properties.map(|property| property.key.name).collect()
         };
-        assert_eq!(keys(0), [Some(bridge_core::ROS_TOPICS)]);
+        // A Twist commands a movement where it arrives.
+        assert_eq!(keys(0), [Some(bridge_core::ROS_TOPICS), Some("Command")]);
         assert!(keys(1).is_empty());
         let uadp::Variant::Array(topics) = fields[0].properties.get(0).unwrap().value else {
             panic!("an array")

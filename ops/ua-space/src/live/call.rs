@@ -267,6 +267,7 @@ impl Asking<'_> {
             name: String::new(),
             description: String::new(),
             ros_topics: Vec::new(),
+            command: false,
             what: described::What::Value(Vec::new()),
         };
         self.begin((places.halt, &halt), &[0, 0], self.timeout())
@@ -461,6 +462,7 @@ impl Asking<'_> {
                 name: String::new(),
                 description: String::new(),
                 ros_topics: Vec::new(),
+                command: false,
                 what: described::What::Value(Vec::new()),
             };
             if self.turn(&none, end, &mut came).await? == Ended::Interrupted {

@@ -23,6 +23,8 @@ pub(crate) struct Described {
     pub(crate) description: String,
     /// The ROS topics and services of a value, each with its space.
     pub(crate) ros_topics: Vec<(u8, String)>,
+    /// Whether the writer says that the value acts where it arrives.
+    pub(crate) command: bool,
     pub(crate) what: What,
 }
 
@@ -111,6 +113,7 @@ impl Described {
             name: called(meta_data.name)?,
             description: bounded(meta_data.description.text, "the description")?,
             ros_topics: ros_topics(meta_data),
+            command: is_command(meta_data),
             what: What::Value(fields(meta_data)?),
         })
     }
@@ -129,6 +132,7 @@ impl Described {
             name: called(meta_data.request.name)?,
             description: bounded(meta_data.request.description.text, "the description")?,
             ros_topics: ros_topics(&meta_data.request),
+            command: false,
             what: What::Call(Call {
                 request: fields(&meta_data.request)?,
                 response: fields(&meta_data.response)?,
@@ -315,14 +319,7 @@ fn read(
         max_string_length: field.max_string_length,
         description: bounded(field.description.text, "the description of a field")?,
         meaning: meaning(field),
-        optional: field
-            .properties
-            .iter()
-            .take(MOST_PROPERTIES)
-            .any(|property| {
-                let yes = Variant::Scalar(Scalar::Boolean(true));
-                property.key.name == Some(OPTIONAL) && property.value == yes
-            }),
+        optional: has_true(field, OPTIONAL),
     })
 }
 
@@ -372,6 +369,19 @@ fn ros_topics(meta_data: &DataSetMetaDataType<'_>) -> Vec<(u8, String)> {
     topics.collect()
 }
 
+/// Returns whether the first field is marked as a command.
+fn is_command(meta_data: &DataSetMetaDataType<'_>) -> bool {
+    let first = meta_data.fields.get(0);
+    first.is_some_and(|first| has_true(&first, COMMAND))
+}
+
+/// Returns whether a property of the field is true.
+fn has_true(field: &FieldMetaData<'_>, name: &str) -> bool {
+    let mut properties = field.properties.iter().take(MOST_PROPERTIES);
+    let yes = Variant::Scalar(Scalar::Boolean(true));
+    properties.any(|property| property.key.name == Some(name) && property.value == yes)
+}
+
 /// Reads the parts of an action from the first field of a request that sends goals.
 fn action(request: &DataSetMetaDataType<'_>) -> Option<Action> {
     let first = request.fields.get(0)?;
@@ -404,6 +414,8 @@ fn bounded(text: Option<&str>, what: &'static str) -> Result<String, &'static st
 
 /// The property of the first field with the ROS topics, each as `1 /joint_states`.
 const ROS_TOPICS: &str = "RosTopics";
+/// The property of the first field of a value that acts where it arrives.
+const COMMAND: &str = "Command";
 /// The property of a field that a request may leave out.
 const OPTIONAL: &str = "Optional";
 /// The property of the first field of a request that sends goals: the DataSetWriterIds of cancel,
@@ -425,6 +437,7 @@ mod tests {
             name: "gripper.Grasp.State".to_owned(),
             description: description.to_owned(),
             ros_topics: Vec::new(),
+            command: false,
             what: What::Value(Vec::new()),
         }
     }

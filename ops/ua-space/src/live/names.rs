@@ -219,6 +219,7 @@ mod tests {
             name: name.to_owned(),
             description: String::new(),
             ros_topics: ros.collect(),
+            command: false,
             what: What::Value(Vec::new()),
         }
     }
