@@ -208,6 +208,7 @@ fn packaged(
     fs::write(&list, notices::audit(&crates)?).with_context(|| list.display().to_string())?;
     let mut objcopy = Command::new("objcopy");
     objcopy
+        .arg("--strip-all")
         .arg(format!("--add-section=.dep-v0={}", list.display()))
         .arg("--set-section-flags=.dep-v0=noload,readonly")
         .args([&built, &listed]);
