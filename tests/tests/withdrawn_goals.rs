@@ -192,6 +192,78 @@ skills:
     component.wait_for_end(SOON);
 }
 
+/// Starts a client that calls a method of the Program of `/patient`.
+fn ask_program(cell: &Cell, method: &str, values: &Value) -> Child {
+    let method = format!("UaSpace/Programs/Patient/{method}");
+    let values = values.to_string();
+    let args = [
+        SERVER_ENDPOINT,
+        &method,
+        "--value",
+        &values,
+        "--patience",
+        "40",
+    ];
+    cell.asyncua_started("opcua_call.py", &args).start()
+}
+
+fn status(client: &mut Child) -> Value {
+    client.wait_for_json("the answer", SOON, |line| line.get("status").cloned())
+}
+
+/// Returns a value of the Program; empty if it cannot be read.
+fn shown(cell: &Cell, path: &str) -> String {
+    let node = format!("ns=1;s=ua_2_2_80.program.{path}");
+    let read = cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, &node]);
+    read.map_or_else(String::new, |read| read[0]["value"].to_string())
+}
+
+#[test]
+fn a_program_needs_a_reset_after_its_server_was_killed_or_ended_during_a_goal() {
+    let Some(cell) = Cell::with(&[Peer::Ros2, Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file("cell.yaml", CELL);
+    let mapping = mapping.to_str().unwrap();
+    let mut patient = server(&cell, "/patient", "0");
+    let _bridge = cell.bridge_ros2_alone(&[mapping]).start();
+    let ask = |method: &str, values: &Value| status(&mut ask_program(&cell, method, values));
+    let is = |state: &str| {
+        eventually(&format!("the Program is {state}"), SOON, || {
+            shown(&cell, "CurrentState").contains(state).then_some(())
+        });
+    };
+    let mut server = cell.ua_server(&[mapping]);
+    is("Ready");
+    for (order, signal) in [(300, Signal::SIGKILL), (302, Signal::SIGTERM)] {
+        assert_eq!(ask("Start", &json!([order])), "Good");
+        patient.wait_for_json("the goal is accepted", SOON, |line| {
+            (line.get("goal")? == order).then_some(())
+        });
+        is("Running");
+        server.signal(signal);
+        server.wait_for_end(SOON);
+        server = cell.ua_server(&[mapping]);
+        is("Halted");
+        assert_eq!(shown(&cell, "FinalResultData.Status"), "0");
+        assert_eq!(ask("Start", &json!([400])), "BadInvalidState");
+        assert_eq!(ask("Reset", &json!([])), "Good");
+        is("Ready");
+    }
+    // After a goal with a known end nothing is unknown.
+    assert_eq!(ask("Start", &json!([3])), "Good");
+    eventually("the goal has ended", SOON, || {
+        (shown(&cell, "FinalResultData.Status") == "4").then_some(())
+    });
+    is("Ready");
+    server.signal(Signal::SIGKILL);
+    server.wait_for_end(SOON);
+    server = cell.ua_server(&[mapping]);
+    is("Ready");
+    let is_asked = |line: &Value| line.get("goal") == Some(&json!(400));
+    assert!(!patient.json_lines().iter().any(is_asked), "{server}");
+}
+
 #[test]
 fn a_program_is_halted_once_its_goal_has_ended() {
     let Some(cell) = Cell::with(&[Peer::Ros2, Peer::Python]) else {
@@ -202,27 +274,8 @@ fn a_program_is_halted_once_its_goal_has_ended() {
     let mut patient = server(&cell, "/patient", "10");
     let _bridge = cell.bridge_ros2_alone(&[mapping]).start();
     let _server = cell.ua_server(&[mapping]);
-    let program = "UaSpace/Programs/Patient";
-    let ask = |method: &str, values: &Value| {
-        let (method, values) = (format!("{program}/{method}"), values.to_string());
-        let args = [
-            SERVER_ENDPOINT,
-            &method,
-            "--value",
-            &values,
-            "--patience",
-            "40",
-        ];
-        cell.asyncua_started("opcua_call.py", &args).start()
-    };
-    let status = |client: &mut Child| {
-        client.wait_for_json("the answer", SOON, |line| line.get("status").cloned())
-    };
-    let shown = |path: &str| {
-        let node = format!("ns=1;s=ua_2_2_80.program.{path}");
-        let read = cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, &node]);
-        read.map_or_else(String::new, |read| read[0]["value"].to_string())
-    };
+    let ask = |method: &str, values: &Value| ask_program(&cell, method, values);
+    let shown = |path: &str| shown(&cell, path);
     let mut started = ask("Start", &json!([300]));
     asked(&mut patient, 300);
     assert_eq!(status(&mut ask("Halt", &json!([]))), "Good");
