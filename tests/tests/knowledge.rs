@@ -264,6 +264,7 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
         "process-steps",
         "processes",
         "run-steps",
+        "run-values",
         "runs",
     ];
     assert_eq!(empty, expected);

@@ -183,6 +183,7 @@ fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
         "mtp",
         "program",
         "registry",
+        "rml",
         "trust",
         "xml-text",
     ] {

@@ -15,7 +15,7 @@ use tracing::{info, warn};
 
 use crate::plan::{Fallen, Offer, Plan, plan};
 use crate::process::{Given, Job, Process, Role};
-use crate::record::{How, Planned, Ran, Run};
+use crate::record::{How, Planned, Ran, Run, Values, recorded};
 
 /// The plant as the execution of a process needs it.
 #[async_trait]
@@ -472,7 +472,7 @@ struct Watched {
 }
 
 impl Watched {
-    fn begins(&self) {
+    fn begins(&self, parameters: Values) {
         self.log.change(|kept, now| {
             let step = kept.step.clone();
             let of = of_step(&self.process, &step);
@@ -482,6 +482,8 @@ impl Watched {
                     of,
                     skill: self.offer.skill.clone(),
                     component: self.offer.component.clone(),
+                    parameters,
+                    results: Values::new(),
                     started_ms: now,
                     ended_ms: None,
                     outcome: How::Running,
@@ -491,7 +493,7 @@ impl Watched {
         });
     }
 
-    fn ends(&self, outcome: How, reason: Option<String>) {
+    fn ends(&self, outcome: How, reason: Option<String>, results: Values) {
         self.log.change(|kept, now| {
             let is_this = |ran: &&mut Ran| ran.ended_ms.is_none() && ran.skill == self.offer.skill;
             if let Some(ran) = kept
@@ -502,6 +504,7 @@ impl Watched {
                 ran.ended_ms = Some(now);
                 ran.outcome = outcome;
                 ran.reason = reason;
+                ran.results = results;
             }
         });
     }
@@ -538,19 +541,23 @@ impl Runs for Watched {
         within: Duration,
     ) -> Result<Outcome, SkillFault> {
         self.is_halted.store(false, Ordering::Relaxed);
-        self.begins();
+        self.begins(recorded(&parameters));
         let outcome = self.inner.run(parameters, within).await;
         match &outcome {
-            Ok(outcome) if outcome.succeeded => self.ends(How::Done, None),
-            Ok(_) if self.is_halted.load(Ordering::Relaxed) => self.ends(How::Stopped, None),
+            Ok(outcome) if outcome.succeeded => {
+                self.ends(How::Done, None, recorded(&outcome.results));
+            }
+            Ok(_) if self.is_halted.load(Ordering::Relaxed) => {
+                self.ends(How::Stopped, None, Values::new());
+            }
             Ok(outcome) => {
                 self.fell(false, &outcome.message);
-                self.ends(How::Failed, Some(outcome.message.clone()));
+                self.ends(How::Failed, Some(outcome.message.clone()), Values::new());
             }
             Err(SkillFault::Lost(why)) => self.fell(true, why),
             Err(fault) => {
                 self.fell(false, &fault.to_string());
-                self.ends(How::Failed, Some(fault.to_string()));
+                self.ends(How::Failed, Some(fault.to_string()), Values::new());
             }
         }
         outcome

@@ -234,7 +234,7 @@ impl Process {
 }
 
 /// Returns the predicate and the literal of a value: structured values are texts of JSON.
-fn literal(value: &serde_json::Value) -> (&'static str, Object) {
+pub(crate) fn literal(value: &serde_json::Value) -> (&'static str, Object) {
     use serde_json::Value;
     let object = match value {
         Value::Bool(value) => Some(Object::Boolean(*value)),

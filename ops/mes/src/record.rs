@@ -4,11 +4,13 @@ use std::collections::VecDeque;
 use std::sync::{Mutex, PoisonError};
 
 use knowledge::vocabulary as v;
-use mtp::{Object, Triple};
+use mtp::{Object, Triple, escaped};
 use serde::Serialize;
+use serde_json::{Map, Value as Json};
+use skills::Value;
 
 use crate::plan::{Fallen, Plan};
-use crate::process::{Process, step_iri};
+use crate::process::{Process, literal, step_iri};
 
 /// The outcome of a process, plan or skill run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -62,10 +64,31 @@ pub(crate) struct Ran {
     pub(crate) of: String,
     pub(crate) skill: String,
     pub(crate) component: String,
+    /// The parameters that it was given.
+    pub(crate) parameters: Values,
+    /// The results that it returned.
+    pub(crate) results: Values,
     pub(crate) started_ms: u64,
     pub(crate) ended_ms: Option<u64>,
     pub(crate) outcome: How,
     pub(crate) reason: Option<String>,
+}
+
+/// Named values of a record.
+pub(crate) type Values = Map<String, Json>;
+
+/// Returns the values for a record. A value of more than 4 KiB is replaced by its size.
+pub(crate) fn recorded(values: &[(String, Value)]) -> Values {
+    let one = |(name, value): &(String, Value)| {
+        let json = value.to_json();
+        let length = json.to_string().len();
+        let json = match length > MOST_VALUE {
+            true => Json::from(format!("not recorded: {length} bytes")),
+            false => json,
+        };
+        (name.clone(), json)
+    };
+    values.iter().map(one).collect()
 }
 
 /// The newest runs, in order; old runs are removed.
@@ -118,6 +141,8 @@ impl Run {
         let mut graph = Graph(Vec::new());
         let run = &self.run;
         graph.say(run, v::RDF_TYPE, iri(v::RUN));
+        graph.say(run, v::RDF_TYPE, iri(v::PROV_ACTIVITY));
+        graph.say(run, v::PROV_USED, iri(&self.process));
         graph.say(run, v::OF_PROCESS, iri(&self.process));
         graph.ends(
             run,
@@ -125,10 +150,12 @@ impl Run {
             (self.ended_ms, self.outcome),
             self.reason.as_deref(),
         );
+        let mut previous = None;
         for plan in &self.plans {
             let plan_iri = format!("{run}/plan/{}", plan.number);
             graph.say(run, v::HAS_PLAN, iri(&plan_iri));
             graph.say(&plan_iri, v::RDF_TYPE, iri(v::PLAN));
+            graph.say(&plan_iri, v::RDF_TYPE, iri(v::PROV_ACTIVITY));
             graph.say(
                 &plan_iri,
                 v::NUMBER,
@@ -155,6 +182,10 @@ impl Run {
                     (ran.ended_ms, ran.outcome),
                     ran.reason.as_deref(),
                 );
+                graph.provenance(&part, ran, &step_iri(&self.process, &ran.of));
+                if let Some(previous) = previous.replace(part.clone()) {
+                    graph.say(&part, v::PROV_WAS_INFORMED_BY, iri(&previous));
+                }
             }
         }
         graph.0
@@ -201,6 +232,33 @@ impl Graph {
         });
     }
 
+    /// States the provenance (PROV-O) of a skill run: its component, step, parameters and results.
+    fn provenance(&mut self, part: &str, ran: &Ran, step: &str) {
+        self.say(part, v::RDF_TYPE, iri(v::PROV_ACTIVITY));
+        self.say(part, v::PROV_WAS_ASSOCIATED_WITH, iri(&ran.component));
+        self.say(&ran.component, v::RDF_TYPE, iri(v::PROV_AGENT));
+        let association = format!("{part}/association");
+        self.say(part, v::PROV_QUALIFIED_ASSOCIATION, iri(&association));
+        self.say(&association, v::RDF_TYPE, iri(v::PROV_ASSOCIATION));
+        self.say(&association, v::PROV_HAD_AGENT, iri(&ran.component));
+        self.say(&association, v::PROV_HAD_PLAN, iri(step));
+        self.say(step, v::RDF_TYPE, iri(v::PROV_PLAN));
+        for (values, kind) in [(&ran.parameters, "parameter"), (&ran.results, "result")] {
+            for (name, value) in values {
+                let entity = format!("{part}/{kind}/{}", escaped(name));
+                if kind == "parameter" {
+                    self.say(part, v::PROV_USED, iri(&entity));
+                } else {
+                    self.say(&entity, v::PROV_WAS_GENERATED_BY, iri(part));
+                }
+                self.say(&entity, v::RDF_TYPE, iri(v::PROV_ENTITY));
+                self.say(&entity, v::HAS_VARIABLE_NAME, Object::Text(name.clone()));
+                let (predicate, value) = literal(value);
+                self.say(&entity, predicate, value);
+            }
+        }
+    }
+
     fn ends(
         &mut self,
         what: &str,
@@ -208,9 +266,13 @@ impl Graph {
         (ended, outcome): (Option<u64>, How),
         reason: Option<&str>,
     ) {
-        self.say(what, v::STARTED, Object::Time(date_time(started)));
+        for predicate in [v::STARTED, v::PROV_STARTED_AT_TIME] {
+            self.say(what, predicate, Object::Time(date_time(started)));
+        }
         if let Some(ended) = ended {
-            self.say(what, v::ENDED, Object::Time(date_time(ended)));
+            for predicate in [v::ENDED, v::PROV_ENDED_AT_TIME] {
+                self.say(what, predicate, Object::Time(date_time(ended)));
+            }
         }
         let outcome = match outcome {
             How::Running => "running",
@@ -248,6 +310,8 @@ pub(crate) fn date_time(ms: u64) -> String {
 }
 
 const MOST_RUNS: usize = 100;
+/// Maximum length of a recorded value as JSON, in bytes.
+const MOST_VALUE: usize = 4096;
 
 #[cfg(test)]
 mod tests {

@@ -1,6 +1,7 @@
 //! The YAML of the MES.
 
-use std::collections::BTreeMap;
+mod files;
+
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -11,6 +12,8 @@ use skills::yaml::{Code, Findings, Kind, Node, Reader, parse};
 use skills::{Lds, Security, TypeName};
 
 use crate::process::{By, Given, Job, Need, Process, Role, Step};
+
+pub(crate) use files::{Manifest, RmlSource, Source};
 
 /// The settings of the MES.
 #[derive(Debug, Clone)]
@@ -34,24 +37,8 @@ pub(crate) struct Settings {
     pub(crate) knowledge: Vec<Source>,
     pub(crate) nodesets: Vec<Source>,
     pub(crate) manifests: Vec<Manifest>,
+    pub(crate) rml: Vec<RmlSource>,
     pub(crate) processes: Vec<Process>,
-}
-
-/// A file, with its name in the YAML.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Source {
-    pub(crate) name: String,
-    pub(crate) path: PathBuf,
-}
-
-/// The manifest of a module.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Manifest {
-    pub(crate) source: Source,
-    /// The IRI of the module.
-    pub(crate) iri: String,
-    /// Classes of capabilities by the name of a service, or of `service/procedure`.
-    pub(crate) capabilities: BTreeMap<String, Vec<String>>,
 }
 
 impl Settings {
@@ -78,7 +65,7 @@ impl Settings {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 14] = [
+const KEYS: [&str; 15] = [
     "mes",
     "application_uri",
     "namespace",
@@ -92,6 +79,7 @@ const KEYS: [&str; 14] = [
     "knowledge",
     "nodesets",
     "manifests",
+    "rml",
     "processes",
 ];
 
@@ -116,6 +104,7 @@ impl Reading<'_> {
             knowledge,
             nodesets,
             manifests,
+            rml,
             processes,
         ] = self.reader.map(root, KEYS)?;
         let name = self
@@ -154,11 +143,15 @@ impl Reading<'_> {
         let manifests = manifests
             .map(|node| self.each(node, Self::manifest))
             .unwrap_or_default();
+        let rml = rml
+            .map(|node| self.each(node, Self::rml))
+            .unwrap_or_default();
         let processes = processes
             .map(|node| self.each(node, Self::process))
             .unwrap_or_default();
         let names = manifests.iter().map(|manifest| &*manifest.source.name);
         self.once(root, names, "manifest");
+        self.files_once(root, &knowledge, &rml);
         let iris = processes.iter().map(|process| &*process.iri);
         self.once(root, iris, "process");
         Some(Settings {
@@ -175,6 +168,7 @@ impl Reading<'_> {
             knowledge,
             nodesets,
             manifests,
+            rml,
             processes,
         })
     }
@@ -206,63 +200,6 @@ impl Reading<'_> {
             }
             seen.push(name);
         }
-    }
-
-    fn files(&mut self, node: &Node) -> Vec<Source> {
-        self.each(node, |reading, node| {
-            let name = reading.reader.text(node, "the path of a file")?;
-            Some(reading.source(name, name))
-        })
-    }
-
-    fn source(&self, name: &str, path: &str) -> Source {
-        Source {
-            name: name.to_owned(),
-            path: self.folder.join(path),
-        }
-    }
-
-    fn manifest(&mut self, node: &Node) -> Option<Manifest> {
-        let [name, file, iri, capabilities] = self
-            .reader
-            .map(node, ["name", "file", "iri", "capabilities"])?;
-        let file = self
-            .reader
-            .needed(file, "file", node.place)
-            .and_then(|node| self.reader.text(node, "the path of a file"));
-        let name = match name {
-            Some(node) => self.name(node),
-            None => file.map(str::to_owned),
-        };
-        let iri = match iri {
-            Some(node) => self.iri(node, Code::Uri),
-            None => name
-                .as_deref()
-                .map(|name| format!("urn:ua-bridge:mtp:{}", mtp::escaped(name))),
-        };
-        let mut told = BTreeMap::new();
-        if let Some(node) = capabilities {
-            let Kind::Map(pairs) = &node.kind else {
-                self.reader.wrong(
-                    node,
-                    "a map from the name of a service to IRIs of capabilities",
-                );
-                return None;
-            };
-            for (service, classes) in pairs {
-                let Some(service) = self.reader.text(service, "the name of a service") else {
-                    continue;
-                };
-                let classes =
-                    self.each(classes, |reading, node| reading.iri(node, Code::Capability));
-                told.insert(service.to_owned(), classes);
-            }
-        }
-        Some(Manifest {
-            source: self.source(&name?, file?),
-            iri: iri?,
-            capabilities: told,
-        })
     }
 
     fn process(&mut self, node: &Node) -> Option<Process> {

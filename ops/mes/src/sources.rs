@@ -7,12 +7,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use knowledge::{Knowledge, Lasting, Source, SourceFiles, SourceKind, nodeset};
 use mtp::{Module, Triple, escaped};
+use rml::{Folder, Mapping};
 use serde::Serialize;
 use tracing::{info, warn};
 
 use crate::cell::now;
 use crate::process::Process;
-use crate::settings::{self, Manifest, Settings};
+use crate::settings::{self, Manifest, RmlSource, Settings};
 
 /// The sources, and the findings about them.
 pub(crate) struct Sources {
@@ -85,6 +86,11 @@ impl Sources {
                 self.module(source, &bytes(&manifest.source)?, manifest, Lasting::No)
             });
         }
+        for rml in &settings.rml {
+            let source = Source::new(SourceKind::File, &rml.mapping.name);
+            named.insert(source.clone());
+            self.try_one(source, |source| self.mapped(source, rml));
+        }
         for process in &settings.processes {
             let source = Source::new(SourceKind::Process, &process.iri);
             named.insert(source.clone());
@@ -154,6 +160,45 @@ impl Sources {
             services,
             "a module is in the graph"
         );
+        Ok(())
+    }
+
+    /// Runs an RML mapping.
+    fn mapped(&self, source: &Source, rml: &RmlSource) -> Result<(), String> {
+        let path = &rml.mapping.path;
+        let at = |what: &dyn std::fmt::Display| format!("{}: {what}", path.display());
+        let text = utf8(&bytes(&rml.mapping)?)?;
+        let mapping = Mapping::read(&text).map_err(|fault| at(&fault))?;
+        let mut folder = Folder::of(path);
+        if let Some(file) = &rml.file {
+            let files: Vec<&str> = mapping.files().into_iter().collect();
+            let [only] = files.as_slice() else {
+                return Err(at(&format!(
+                    "it reads several files ({}), which the key `file` cannot replace; remove the \
+                     key",
+                    files.join(", ")
+                )));
+            };
+            folder = folder.with(only, bytes(file)?);
+        }
+        let output = mapping.run(&mut folder).map_err(|fault| at(&fault))?;
+        let turtle = output.turtle().map_err(|error| error.to_string())?;
+        let read = self
+            .knowledge
+            .replace_turtle(source, &utf8(&turtle)?, now());
+        read.map_err(|fault| fault.to_string())?;
+        let graphs = output.has_graphs().then(|| {
+            "a source is one graph; the graphs of the mapping are merged in it".to_owned()
+        });
+        let findings = mapping.findings().iter().cloned();
+        let findings = findings.chain(output.findings).chain(graphs);
+        let findings: Vec<Finding> = findings
+            .map(|what| finding(source, at(&what), false))
+            .collect();
+        for found in &findings {
+            warn!(source = source.name, "{}", found.what);
+        }
+        self.state().findings.insert(source.clone(), findings);
         Ok(())
     }
 
@@ -289,3 +334,50 @@ fn finding(source: &Source, what: String, refused: bool) -> Finding {
 
 /// Maximum size of a file in bytes.
 const LARGEST: u64 = 64 << 20;
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    #[test]
+    fn an_rml_mapping_of_the_yaml_is_a_source_and_its_faults_are_findings() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/plant");
+        let yaml = |rml: &str| {
+            let text = format!("mes: m\napplication_uri: urn:x\nnamespace: 5\nrml: [{rml}]\n");
+            Settings::from_yaml(&text, &folder).unwrap()
+        };
+        let knowledge = Arc::new(Knowledge::new().unwrap());
+        let sources = Sources::new(Arc::clone(&knowledge));
+        let statements = |name: &str| {
+            let all = knowledge.sources();
+            let found = all.iter().find(|source| source.name == name);
+            found.map(|source| source.statements)
+        };
+
+        sources.read(&yaml("parts.rml.ttl"));
+        assert_eq!(sources.findings(), []);
+        assert_eq!(statements("parts.rml.ttl"), Some(10));
+
+        sources.read(&yaml(
+            "{mapping: parts.rml.ttl, file: parts.xml, name: parts}",
+        ));
+        assert_eq!(statements("parts.rml.ttl"), None, "it left the YAML");
+        assert_eq!(statements("parts"), Some(10));
+
+        sources.read(&yaml(
+            "{mapping: parts.rml.ttl, file: mes.yaml, name: parts}",
+        ));
+        let findings = sources.findings();
+        let [found] = findings.as_slice() else {
+            panic!("{findings:?}")
+        };
+        assert!(found.refused);
+        for part in
+            ["parts.rml.ttl: triples map <urn:example:parts:Parts>: source `parts.xml`: line 1"]
+        {
+            assert!(found.what.contains(part), "{}", found.what);
+        }
+    }
+}

@@ -220,6 +220,25 @@ pub(crate) enum Verb {
     /// time, or the user may not change sources, 74 a file cannot be read or the output cannot be
     /// written.
     Source(Source),
+    /// Run an RML mapping of XML files and print RDF
+    ///
+    /// The mapping is Turtle in the vocabulary of R2RML and RML (semweb.mmlab.be/ns/rml#) or in
+    /// that of w3id.org/rml/. It reads files of its own folder. Values that are no term are
+    /// reported on stderr, and cost single statements only. `ua-space source add FILE --rml
+    /// MAPPING` adds the statements to the knowledge of the plant.
+    ///
+    /// Exit codes: 0 done, 64 usage, 65 the mapping or a file is wrong, 74 a file cannot be read or
+    /// the output cannot be written.
+    Rml(Rml),
+    /// Print NodeSets as OWL ontologies
+    ///
+    /// Prints all nodes, references, modelling rules, interfaces, DataTypes and values as Turtle.
+    /// Required models are imports. Each NodeSet is an ontology of its own; name several files to
+    /// get all of them in one graph.
+    ///
+    /// Exit codes: 0 done, 65 a file is no NodeSet, 74 a file cannot be read or the output cannot
+    /// be written.
+    Owl(Owl),
     /// Print the completion script of a shell, which also completes names of skills and topics
     ///
     /// For bash: `source <(ua-space completion bash)`; for zsh likewise; for fish: `ua-space
@@ -246,6 +265,36 @@ pub(crate) enum Shell {
     Zsh,
     /// Fish
     Fish,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Rml {
+    /// The mapping, a file of Turtle
+    #[arg(value_name = "MAPPING")]
+    pub(crate) mapping: String,
+    /// Files in the place of those that the mapping names, as NAME=FILE; FILE alone if it names one
+    /// file only. - for stdin
+    #[arg(value_name = "FILE")]
+    pub(crate) files: Vec<String>,
+    /// The format of the output
+    #[arg(long, value_name = "FORMAT", value_enum, default_value = "turtle")]
+    pub(crate) format: RdfFormat,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Owl {
+    /// NodeSet2 files, or - for stdin
+    #[arg(value_name = "FILE", required = true)]
+    pub(crate) files: Vec<String>,
+}
+
+/// A format of RDF.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum RdfFormat {
+    /// Turtle; TriG if the mapping has graphs
+    Turtle,
+    /// N-Quads
+    Nquads,
 }
 
 #[derive(Debug, Args)]

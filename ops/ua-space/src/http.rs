@@ -72,6 +72,15 @@ impl Server {
             .await
     }
 
+    /// Requests a page as Turtle.
+    ///
+    /// # Errors
+    /// See [`get`](Self::get).
+    pub(crate) async fn get_turtle(&self, path: &str) -> Result<Answer, Failure> {
+        self.request(Method::GET, path, ("text/turtle", "", Bytes::new()))
+            .await
+    }
+
     /// Sends a SPARQL query.
     ///
     /// # Errors

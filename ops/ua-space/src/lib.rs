@@ -28,10 +28,12 @@ mod make_keys;
 mod messages;
 mod metadata;
 mod new;
+mod owl;
 mod packet;
 mod page;
 mod raw_data;
 mod report;
+mod rml;
 mod selector;
 mod session;
 mod shape;
@@ -91,6 +93,8 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Page(_) => return page::page(given),
         Verb::Ask(arguments) => ask::ask(arguments),
         Verb::Source(arguments) => source::source(arguments),
+        Verb::Rml(arguments) => rml::rml(arguments),
+        Verb::Owl(arguments) => owl::owl(arguments),
         Verb::Completion(arguments) => completion::script(arguments.shell),
         Verb::Complete(arguments) => completion::complete(&arguments.words),
     };

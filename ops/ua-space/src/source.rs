@@ -21,12 +21,17 @@ pub(crate) fn source(arguments: &Source) -> Result<(), Failure> {
             file,
             kind,
             name,
+            rml,
             at,
         } => {
-            let contents = read(file)?;
-            let kind = match kind {
-                Some(kind) => kind.clone(),
-                None => kind_of(file, &contents)?.to_owned(),
+            let mut contents = read(file)?;
+            let kind = match (kind, rml) {
+                (Some(kind), _) => kind.clone(),
+                (None, Some(mapping)) => {
+                    contents = crate::rml::turtle(mapping, contents)?;
+                    "file".to_owned()
+                }
+                (None, None) => kind_of(file, &contents)?.to_owned(),
             };
             let name = match name {
                 Some(name) => name.clone(),
@@ -42,6 +47,7 @@ pub(crate) fn source(arguments: &Source) -> Result<(), Failure> {
             change("DELETE", &path, ("", Vec::new()), at)?;
             say(&format!("{kind} {name}: removed"))
         }
+        SourceVerb::Check { turtle, json, at } => check(*turtle, *json, at),
         SourceVerb::Update { file, at } => {
             let update = read(file)?;
             change("POST", "/update", ("application/sparql-update", update), at)?;
@@ -120,6 +126,71 @@ fn list(json: bool, at: &SourceAt) -> Result<(), Failure> {
     })
 }
 
+/// A report of shapes.
+#[derive(Debug, Deserialize)]
+struct Report {
+    conforms: bool,
+    results: Vec<Violation>,
+    unchecked: Vec<String>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Violation {
+    focus: String,
+    path: Option<String>,
+    value: Option<String>,
+    message: String,
+    severity: Option<String>,
+}
+
+fn check(turtle: bool, json: bool, at: &SourceAt) -> Result<(), Failure> {
+    let server = Server::parse(&at.url)?;
+    look(async {
+        let answer = match turtle {
+            true => server.get_turtle("/report").await?,
+            false => server.get("/report").await?,
+        };
+        if answer.status != 200 {
+            return Err(refusal(&answer));
+        }
+        let mut out = io::stdout().lock();
+        if turtle {
+            for line in answer.body.lines() {
+                writeln!(out, "{}", harmless(line))?;
+            }
+            return Ok(());
+        }
+        let report: Report = serde_json::from_str(&answer.body)
+            .map_err(|error| Failure::Data(format!("cannot read the response: {error}")))?;
+        if json {
+            let text = mappings::harmless_json(answer.body.trim_end());
+            writeln!(out, "{text}")?;
+        } else if !report.results.is_empty() {
+            let columns = ["SEVERITY", "NODE", "PATH", "VALUE", "MESSAGE"];
+            let mut table = Table::new(columns.map(str::to_owned));
+            for found in &report.results {
+                let dash = || "-".to_owned();
+                table.row([
+                    found.severity.clone().unwrap_or_else(dash),
+                    found.focus.clone(),
+                    found.path.clone().unwrap_or_else(dash),
+                    found.value.clone().unwrap_or_else(dash),
+                    found.message.clone(),
+                ]);
+            }
+            table.write(&mut out, is_coloured())?;
+        }
+        for unchecked in &report.unchecked {
+            crate::report::warn(&harmless(&format!("not checked: {unchecked}")));
+        }
+        match report.conforms {
+            true if json => Ok(()),
+            true => Ok(writeln!(out, "the knowledge conforms to its shapes")?),
+            false => Err(Failure::Told),
+        }
+    })
+}
+
 /// Sends a change. Returns the status.
 fn change(
     method: &'static str,
@@ -151,7 +222,7 @@ fn change(
     })
 }
 
-fn read(file: &str) -> Result<Vec<u8>, Failure> {
+pub(crate) fn read(file: &str) -> Result<Vec<u8>, Failure> {
     let mut bytes = Vec::new();
     let read = match file {
         "-" => io::stdin().lock().take(LARGEST).read_to_end(&mut bytes),

@@ -181,12 +181,17 @@ impl Site {
                 &json!({ "graphs": self.queries.knowledge().sources() }),
             )),
             "/data" => self.data(&pairs),
+            "/report" => {
+                let accepted = accepted(&request);
+                let is_json = accepted.first().is_some_and(|media| media == JSON);
+                self.report(is_json, peer).await
+            }
             path => match path.strip_prefix("/ask/") {
                 Some(name) => self.question(name, pairs, accepted(&request)).await,
                 None => match (self.page)(path) {
                     Some(page) => Ok(content(JSON, page.into_bytes())),
                     None => Err(Refusal::unknown(
-                        "there are /sparql, /update, /store, /sources, /ask, /ask/NAME, /graphs, /data and /status here"
+                        "there are /sparql, /update, /store, /sources, /ask, /ask/NAME, /graphs, /data, /report and /status here"
                             .to_owned(),
                     )),
                 },

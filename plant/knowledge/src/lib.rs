@@ -15,16 +15,20 @@
 //! Reading order: `source` (the named graphs), `store`, `writing` (replacement and derivation) and
 //! `journal` (lasting sources), `component` and `nodeset` (facts to statements), `question` (named
 //! queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the queries that run at a
-//! time), `http`, `update` and `writes` (changes by users).
+//! time), `http`, `update` and `writes` (changes by users), `shapes` and `checking` (the SHACL
+//! report).
 
 mod bounds;
+mod checking;
 mod component;
 mod http;
 mod journal;
 mod lanes;
 pub mod nodeset;
+pub mod owl;
 mod query;
 mod question;
+mod shapes;
 mod source;
 mod store;
 mod update;

@@ -386,6 +386,6 @@ const HAS_COMPONENT: &str = "i=47";
 const HAS_ORDERED_COMPONENT: &str = "i=49";
 
 /// The largest published file has 13 MB.
-const MAX_FILE: usize = 64 << 20;
+pub(crate) const MAX_FILE: usize = 64 << 20;
 const MAX_DEPTH: usize = 64;
-const MAX_NODES: usize = 200_000;
+pub(crate) const MAX_NODES: usize = 200_000;

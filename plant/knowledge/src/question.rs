@@ -112,6 +112,10 @@ pub const QUESTIONS: &[Question] = &[
         sparql: include_str!("../queries/run-steps.rq"),
     },
     Question {
+        name: "run-values",
+        sparql: include_str!("../queries/run-values.rq"),
+    },
+    Question {
         name: "runs",
         sparql: include_str!("../queries/runs.rq"),
     },

@@ -76,7 +76,7 @@ pub(super) async fn send(at: SocketAddr, request: String) -> Answered {
     }
 }
 
-async fn get(at: SocketAddr, path: &str, accept: &str) -> Answered {
+pub(super) async fn get(at: SocketAddr, path: &str, accept: &str) -> Answered {
     send(
         at,
         format!(

@@ -2,6 +2,8 @@
 
 mod http;
 mod memory;
+mod owl;
+mod shapes;
 mod store;
 mod vocabulary;
 mod writes;

@@ -128,6 +128,23 @@ terms!(OURS, "urn:ua-bridge:plant#",
     DataProperty WITHIN = "within",
 );
 
+terms!(PROV, "http://www.w3.org/ns/prov#",
+    Class PROV_ACTIVITY = "Activity",
+    Class PROV_AGENT = "Agent",
+    Class PROV_ASSOCIATION = "Association",
+    Class PROV_ENTITY = "Entity",
+    Class PROV_PLAN = "Plan",
+    ObjectProperty PROV_HAD_AGENT = "agent",
+    ObjectProperty PROV_HAD_PLAN = "hadPlan",
+    ObjectProperty PROV_QUALIFIED_ASSOCIATION = "qualifiedAssociation",
+    ObjectProperty PROV_USED = "used",
+    ObjectProperty PROV_WAS_ASSOCIATED_WITH = "wasAssociatedWith",
+    ObjectProperty PROV_WAS_GENERATED_BY = "wasGeneratedBy",
+    ObjectProperty PROV_WAS_INFORMED_BY = "wasInformedBy",
+    DataProperty PROV_ENDED_AT_TIME = "endedAtTime",
+    DataProperty PROV_STARTED_AT_TIME = "startedAtTime",
+);
+
 terms!(STANDARD, "",
     Class RDFS_CLASS = "http://www.w3.org/2000/01/rdf-schema#Class",
     ObjectProperty RDF_TYPE = "http://www.w3.org/1999/02/22-rdf-syntax-ns#type",
@@ -145,14 +162,16 @@ pub fn foreign() -> impl Iterator<Item = Term> {
 pub fn all() -> impl Iterator<Item = Term> {
     foreign()
         .chain(OURS.iter().copied())
+        .chain(PROV.iter().copied())
         .chain(STANDARD.iter().copied())
 }
 
 /// The prefixes with which questions abbreviate the IRIs.
-pub const PREFIXES: [(&str, &str); 5] = [
+pub const PREFIXES: [(&str, &str); 6] = [
     ("css", "http://www.w3id.org/hsu-aut/css#"),
     ("cask", "http://www.w3id.org/hsu-aut/cask#"),
     ("ua", "urn:ua-bridge:plant#"),
+    ("prov", "http://www.w3.org/ns/prov#"),
     ("rdfs", "http://www.w3.org/2000/01/rdf-schema#"),
     ("xsd", "http://www.w3.org/2001/XMLSchema#"),
 ];

@@ -17,6 +17,10 @@ pub const FOREIGN: &[(&str, &str)] = &[
     ("mtp", "manifests of eight modules (MIT, ISC)"),
     ("nodesets", "NodeSets of the OPC Foundation (MIT 1.00)"),
     ("ontologies", "CSS and CaSk ontologies (MIT)"),
+    (
+        "rml",
+        "test cases of RML with XML sources (imec and contributors, CC BY 4.0)",
+    ),
     ("ros1-niryo", "ROS definitions of ned_ros (GPL-3.0)"),
 ];
 

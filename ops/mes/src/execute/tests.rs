@@ -165,11 +165,13 @@ impl Runs for FakeSkill {
                 trace: vec![],
             });
         }
+        let width = ("Width".to_owned(), Value::Double(0.03));
+        let results = name.ends_with(".Grasp").then_some(width);
         Ok(Outcome {
             run: 1,
             succeeded: true,
             message: String::new(),
-            results: vec![],
+            results: results.into_iter().collect(),
             trace: vec![],
         })
     }
@@ -575,9 +577,26 @@ async fn what_became_of_a_run_can_be_asked_for() {
         (&"done".into(), &2.into())
     );
     let steps = knowledge
-        .ask("run-steps", &[("run".into(), run.run)])
+        .ask("run-steps", &[("run".into(), run.run.clone())])
         .unwrap();
     assert_eq!(steps.rows.len(), 12);
+    let values = knowledge
+        .ask("run-values", &[("run".into(), run.run)])
+        .unwrap();
+    let of = |kind: &str| {
+        let rows = values.rows.iter().filter(|row| row["use"] == kind);
+        let shown = rows.map(|row| (row["skill"].clone(), row["value"].clone()));
+        shown.collect::<Vec<_>>()
+    };
+    let width = ("urn:example:vacuum#Grasp".into(), 0.03.into());
+    assert_eq!(of("result"), [width]);
+    assert_eq!(of("parameter").len(), 9, "one of each movement: {values:?}");
+    let mut quads = Vec::new();
+    knowledge.write_quads(None, &mut quads).unwrap();
+    let quads = String::from_utf8(quads).unwrap();
+    let count = |predicate: &str| quads.matches(&format!("/ns/prov#{predicate}>")).count();
+    assert_eq!(count("wasInformedBy"), 11);
+    assert_eq!(count("hadPlan"), 12);
     let lost: Vec<_> = steps
         .rows
         .iter()

@@ -284,7 +284,7 @@ pub(crate) enum SourceVerb {
     },
     /// Add or replace a source
     Add {
-        /// A NodeSet, a manifest (.aml, .mtp, .amlx), or Turtle (.ttl); - for stdin
+        /// A NodeSet, a manifest (.aml, .mtp, .amlx), Turtle (.ttl), or XML with --rml; - for stdin
         #[arg(value_name = "FILE")]
         file: String,
         /// file (Turtle), nodeset, mtp or process (Turtle); found by the name and contents of the
@@ -295,6 +295,9 @@ pub(crate) enum SourceVerb {
         /// namespace
         #[arg(long = "as", value_name = "NAME")]
         name: Option<String>,
+        /// The RML mapping that makes RDF of the file, which is XML
+        #[arg(long, value_name = "MAPPING", conflicts_with = "kind")]
+        rml: Option<String>,
         #[command(flatten)]
         at: SourceAt,
     },
@@ -306,6 +309,20 @@ pub(crate) enum SourceVerb {
         /// The name of the source, as `ua-space source list` shows it
         #[arg(value_name = "NAME")]
         name: String,
+        #[command(flatten)]
+        at: SourceAt,
+    },
+    /// Check the knowledge against shapes (SHACL), and print the violations
+    ///
+    /// The shapes of ua-mes and of the sources are checked. Exit code 65 if there are
+    /// violations.
+    Check {
+        /// Print the report in the vocabulary of SHACL
+        #[arg(long)]
+        turtle: bool,
+        /// Print the report as JSON
+        #[arg(long, conflicts_with = "turtle")]
+        json: bool,
         #[command(flatten)]
         at: SourceAt,
     },

@@ -1,0 +1,126 @@
+//! The files that the YAML names.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use skills::yaml::{Code, Kind, Node};
+
+use super::Reading;
+
+/// A file, with its name in the YAML.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Source {
+    pub(crate) name: String,
+    pub(crate) path: PathBuf,
+}
+
+/// An RML mapping of XML files.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct RmlSource {
+    /// The mapping.
+    pub(crate) mapping: Source,
+    /// The file in the place of the only file that the mapping names.
+    pub(crate) file: Option<Source>,
+}
+
+/// The manifest of a module.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Manifest {
+    pub(crate) source: Source,
+    /// The IRI of the module.
+    pub(crate) iri: String,
+    /// Classes of capabilities by the name of a service, or of `service/procedure`.
+    pub(crate) capabilities: BTreeMap<String, Vec<String>>,
+}
+
+impl Reading<'_> {
+    pub(super) fn files(&mut self, node: &Node) -> Vec<Source> {
+        self.each(node, |reading, node| {
+            let name = reading.reader.text(node, "the path of a file")?;
+            Some(reading.source(name, name))
+        })
+    }
+
+    fn source(&self, name: &str, path: &str) -> Source {
+        Source {
+            name: name.to_owned(),
+            path: self.folder.join(path),
+        }
+    }
+
+    /// Checks that no two files of the graph have one name.
+    pub(super) fn files_once(&mut self, root: &Node, files: &[Source], rml: &[RmlSource]) {
+        let names = files.iter().map(|file| &*file.name);
+        let names = names.chain(rml.iter().map(|rml| &*rml.mapping.name));
+        self.once(root, names, "file");
+    }
+
+    /// Reads a mapping: its path, or a map.
+    pub(super) fn rml(&mut self, node: &Node) -> Option<RmlSource> {
+        if !matches!(node.kind, Kind::Map(_)) {
+            let path = self.reader.text(node, "the path of a mapping, or a map")?;
+            return Some(RmlSource {
+                mapping: self.source(path, path),
+                file: None,
+            });
+        }
+        let [mapping, file, name] = self.reader.map(node, ["mapping", "file", "name"])?;
+        let mapping = self.reader.needed(mapping, "mapping", node.place)?;
+        let mapping = self.reader.text(mapping, "the path of a mapping")?;
+        let file = match file {
+            Some(node) => Some(self.reader.text(node, "the path of a file")?),
+            None => None,
+        };
+        let name = match name {
+            Some(node) => self.reader.text(node, "a name")?,
+            None => file.unwrap_or(mapping),
+        };
+        Some(RmlSource {
+            mapping: self.source(name, mapping),
+            file: file.map(|file| self.source(file, file)),
+        })
+    }
+
+    pub(super) fn manifest(&mut self, node: &Node) -> Option<Manifest> {
+        let [name, file, iri, capabilities] = self
+            .reader
+            .map(node, ["name", "file", "iri", "capabilities"])?;
+        let file = self
+            .reader
+            .needed(file, "file", node.place)
+            .and_then(|node| self.reader.text(node, "the path of a file"));
+        let name = match name {
+            Some(node) => self.name(node),
+            None => file.map(str::to_owned),
+        };
+        let iri = match iri {
+            Some(node) => self.iri(node, Code::Uri),
+            None => name
+                .as_deref()
+                .map(|name| format!("urn:ua-bridge:mtp:{}", mtp::escaped(name))),
+        };
+        let mut told = BTreeMap::new();
+        if let Some(node) = capabilities {
+            let Kind::Map(pairs) = &node.kind else {
+                self.reader.wrong(
+                    node,
+                    "a map from the name of a service to IRIs of capabilities",
+                );
+                return None;
+            };
+            for (service, classes) in pairs {
+                let Some(service) = self.reader.text(service, "the name of a service") else {
+                    continue;
+                };
+                let classes =
+                    self.each(classes, |reading, node| reading.iri(node, Code::Capability));
+                told.insert(service.to_owned(), classes);
+            }
+        }
+        Some(Manifest {
+            source: self.source(&name?, file?),
+            iri: iri?,
+            capabilities: told,
+        })
+    }
+}

@@ -1,0 +1,143 @@
+//! The report of the shapes over HTTP.
+
+use std::net::IpAddr;
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::Full;
+use hyper::{Response, StatusCode};
+use oxigraph::model::{BlankNode, Literal, NamedNode, Term};
+use oxigraph::sparql::results::QueryResultsFormat;
+use serde::Deserialize;
+use tokio::time::Instant;
+
+use crate::http::{Refusal, Site, content, json_page};
+use crate::lanes::Lane;
+use crate::query::{Asked, Dataset, Formats, QueryFault, Results};
+use crate::shapes::{Check, Report, Shapes, Violation};
+
+impl Site {
+    /// Checks the knowledge against the shapes. The report is Turtle, or JSON if that is accepted.
+    pub(crate) async fn report(
+        &self,
+        is_json: bool,
+        peer: IpAddr,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        let failed =
+            |what: String| Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "failed", &what);
+        let shapes = Shapes::of(self.queries.knowledge());
+        let shapes = shapes.map_err(|fault| failed(fault.to_string()))?;
+        let (checks, unchecked) = shapes.checks();
+        let mut report = Report {
+            unchecked,
+            ..Report::default()
+        };
+        let end = Instant::now() + TIME;
+        for check in checks {
+            let asked = Asked::Sparql(
+                check.query.clone(),
+                Dataset::default(),
+                Formats {
+                    solutions: Some(QueryResultsFormat::Json),
+                    triples: None,
+                },
+            );
+            let running = self.queries.run(asked, Lane::Open(peer));
+            match tokio::time::timeout_at(end, running).await {
+                Ok(Ok(Results::Written(_, rows))) => {
+                    let rows = rows_of(&rows).map_err(failed)?;
+                    report
+                        .violations
+                        .extend(rows.into_iter().filter_map(|row| violation(&check, row)));
+                }
+                Ok(Ok(_)) => {}
+                Ok(Err(fault @ QueryFault::Busy(_))) => return Err(fault.into()),
+                Ok(Err(fault)) => report.not_checked(&check, &fault.to_string()),
+                Err(_) => report.not_checked(&check, "the time of the report is over"),
+            }
+        }
+        match is_json {
+            true => Ok(json_page(&report.json())),
+            false => {
+                let turtle = report.turtle(&shapes);
+                let turtle = turtle.map_err(|error| failed(error.to_string()))?;
+                Ok(content("text/turtle", turtle))
+            }
+        }
+    }
+}
+
+impl Report {
+    fn not_checked(&mut self, check: &Check, why: &str) {
+        let Check {
+            shape, component, ..
+        } = check;
+        self.unchecked.push(format!("{shape}: {component}: {why}"));
+    }
+}
+
+/// The JSON results format of SPARQL 1.1.
+#[derive(Debug, Deserialize)]
+struct Solutions {
+    results: Bindings,
+}
+
+#[derive(Debug, Deserialize)]
+struct Bindings {
+    bindings: Vec<Row>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Row {
+    this: Option<Found>,
+    value: Option<Found>,
+    path: Option<Found>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Found {
+    #[serde(rename = "type")]
+    kind: String,
+    value: String,
+    datatype: Option<String>,
+    #[serde(rename = "xml:lang")]
+    language: Option<String>,
+}
+
+fn rows_of(json: &[u8]) -> Result<Vec<Row>, String> {
+    let read: Solutions = serde_json::from_slice(json).map_err(|error| error.to_string())?;
+    Ok(read.results.bindings)
+}
+
+fn violation(check: &Check, row: Row) -> Option<Violation> {
+    let path = row.path.map(term).map(|path| {
+        let text = path.to_string();
+        (path, text)
+    });
+    Some(Violation {
+        focus: row.this.map(term)?,
+        value: row.value.map(term),
+        path: path.or_else(|| check.path.clone()),
+        shape: check.shape.clone(),
+        component: check.component.clone(),
+        severity: check.severity.clone(),
+        message: check.message.clone(),
+    })
+}
+
+fn term(found: Found) -> Term {
+    match (found.kind.as_str(), found.datatype, found.language) {
+        ("uri", ..) => NamedNode::new_unchecked(found.value).into(),
+        ("bnode", ..) => BlankNode::new_unchecked(found.value).into(),
+        (_, _, Some(language)) => {
+            Literal::new_language_tagged_literal_unchecked(found.value, language).into()
+        }
+        (_, Some(datatype), None) => {
+            Literal::new_typed_literal(found.value, NamedNode::new_unchecked(datatype)).into()
+        }
+        (_, None, None) => Literal::new_simple_literal(found.value).into(),
+    }
+}
+
+/// Time limit of a report, below that of clients.
+const TIME: Duration = Duration::from_secs(10);

@@ -1,0 +1,318 @@
+//! Reads term maps: constants, templates and references.
+
+use oxrdf::{BlankNode, Literal, NamedNode, NamedOrBlankNode, Term};
+
+use super::{Reading, Scope, TermNode, named};
+use crate::mapping::{Expression, Part, TermKind, TermMap, TermValue};
+use crate::xpath::{Namespaces, parse};
+
+impl<'a> Reading<'a> {
+    /// Returns the term maps of a role, and the constants of its shortcut.
+    pub(super) fn term_nodes(
+        &self,
+        node: &NamedOrBlankNode,
+        role: &str,
+    ) -> Result<Vec<TermNode<'a>>, String> {
+        let shortcuts = self.graph.all(node, role);
+        let mut all: Vec<TermNode<'a>> = shortcuts.into_iter().map(TermNode::Constant).collect();
+        let property = format!("{role}Map");
+        for map in self.graph.all(node, &property) {
+            all.push(TermNode::Map(self.node(map, &property)?));
+        }
+        Ok(all)
+    }
+
+    /// Returns the graph maps, without the default graph.
+    pub(super) fn graphs(
+        &mut self,
+        node: &'a NamedOrBlankNode,
+        scope: &mut Scope<'_>,
+    ) -> Result<Vec<TermMap>, String> {
+        let mut graphs = Vec::new();
+        for graph in self.graph_nodes(node)? {
+            let graph = self.term(graph, "graph", TermKind::Iri, scope)?;
+            if graph.kind == TermKind::Literal {
+                return Err("a graph is no literal; remove its term type".to_owned());
+            }
+            graphs.push(graph);
+        }
+        Ok(graphs)
+    }
+
+    /// Returns graph maps. A map in the place of the constant of `rr:graph` counts as well.
+    fn graph_nodes(&self, node: &NamedOrBlankNode) -> Result<Vec<TermNode<'a>>, String> {
+        let mut all = self.term_nodes(node, "graph")?;
+        for one in &mut all {
+            if let TermNode::Constant(term @ Term::BlankNode(_)) = one
+                && let Ok(map) = self.node(term, "graph")
+            {
+                *one = TermNode::Map(map);
+            }
+        }
+        Ok(all)
+    }
+
+    /// Reads a term map of a role.
+    pub(super) fn term(
+        &mut self,
+        node: TermNode<'a>,
+        role: &str,
+        usual: TermKind,
+        scope: &Scope<'_>,
+    ) -> Result<TermMap, String> {
+        let node = match node {
+            TermNode::Constant(term) => return constant(term, role),
+            TermNode::Map(node) => node,
+        };
+        self.known_only(scope.map, node, &format!("the {role} map"), known(role));
+        if role != "subject" && !self.graph.all(node, "class").is_empty() {
+            let what = format!(
+                "`class` belongs to a subject map, and is ignored in the {role} map; give the \
+                 class in a triples map for these resources"
+            );
+            self.note(scope.map, &what);
+        }
+        if let Some(term) = self.graph.one(node, "constant")? {
+            return constant(term, role);
+        }
+        let expression = self.expression(node, scope)?;
+        let expression = expression.ok_or_else(|| {
+            format!("the {role} map has no constant, template or reference of its own")
+        })?;
+        let language = self.shared(node, "language", scope)?;
+        let datatype = self.shared(node, "datatype", scope)?;
+        if let Some(tag) = language.as_ref().and_then(Expression::constant)
+            && !is_language(tag)
+        {
+            return Err(format!(
+                "`{tag}` is no language tag; use one of BCP 47, such as `en`"
+            ));
+        }
+        let is_literal = language.is_some() || datatype.is_some();
+        let kind = match self
+            .graph
+            .one(node, "termType")?
+            .map(|kind| (kind, named(kind)))
+        {
+            Some((_, Some("IRI" | "URI"))) => TermKind::Iri,
+            Some((_, Some("UnsafeIRI" | "UnsafeURI"))) => TermKind::UnsafeIri,
+            Some((_, Some("BlankNode"))) => TermKind::BlankNode,
+            Some((_, Some("Literal"))) => TermKind::Literal,
+            Some((kind, _)) => return Err(format!("unknown term type {kind}")),
+            None if role == "object" && (is_literal || !expression.is_template) => {
+                TermKind::Literal
+            }
+            None => usual,
+        };
+        Ok(TermMap {
+            value: TermValue::Expression(expression),
+            kind,
+            language,
+            datatype,
+        })
+    }
+
+    /// Reads a side of a join condition.
+    pub(super) fn side(
+        &mut self,
+        join: &'a NamedOrBlankNode,
+        side: &str,
+        scope: &Scope<'_>,
+    ) -> Result<Expression, String> {
+        if let Some(written) = self.graph.text(join, side)? {
+            return reference(written, scope.namespaces);
+        }
+        let found = self.shared(join, side, scope)?;
+        found.ok_or_else(|| format!("a join condition has no `{side}`"))
+    }
+
+    /// Reads an expression that is given as a constant, or by a map.
+    fn shared(
+        &mut self,
+        node: &'a NamedOrBlankNode,
+        property: &str,
+        scope: &Scope<'_>,
+    ) -> Result<Option<Expression>, String> {
+        let text = match self.graph.one(node, property)? {
+            Some(Term::Literal(text)) => Some(text.value()),
+            Some(Term::NamedNode(iri)) => Some(iri.as_str()),
+            Some(other) => return Err(format!("`{property}` is no {other}")),
+            None => None,
+        };
+        if let Some(text) = text {
+            return Ok(Some(Expression::of(text)));
+        }
+        let property = format!("{property}Map");
+        let Some(map) = self.graph.one(node, &property)? else {
+            return Ok(None);
+        };
+        let map = self.node(map, &property)?;
+        match self.graph.one(map, "constant")? {
+            Some(Term::Literal(text)) => Ok(Some(Expression::of(text.value()))),
+            Some(Term::NamedNode(iri)) => Ok(Some(Expression::of(iri.as_str()))),
+            _ => self.expression(map, scope),
+        }
+    }
+
+    /// Reads the template or reference of a term map.
+    fn expression(
+        &self,
+        node: &NamedOrBlankNode,
+        scope: &Scope<'_>,
+    ) -> Result<Option<Expression>, String> {
+        let written = self.graph.text(node, "template")?;
+        let reference = self.graph.text(node, "reference")?;
+        match (written, reference) {
+            (Some(_), Some(_)) => Err("a map has both a template and a reference".to_owned()),
+            (Some(written), None) => template(written, scope.namespaces).map(Some),
+            (None, Some(written)) => self::reference(written, scope.namespaces).map(Some),
+            (None, None) => Ok(None),
+        }
+    }
+}
+
+impl Expression {
+    fn of(text: &str) -> Self {
+        Self {
+            parts: vec![Part::Text(text.to_owned())],
+            is_template: false,
+            written: text.to_owned(),
+        }
+    }
+
+    /// Returns the text, if it is the same for all rows.
+    pub(crate) fn constant(&self) -> Option<&str> {
+        match self.parts.as_slice() {
+            [] => Some(""),
+            [Part::Text(text)] => Some(text),
+            _ => None,
+        }
+    }
+}
+
+fn constant(term: &Term, role: &str) -> Result<TermMap, String> {
+    let kind = match term {
+        Term::NamedNode(_) => TermKind::Iri,
+        Term::BlankNode(_) => TermKind::BlankNode,
+        Term::Literal(_) => TermKind::Literal,
+    };
+    let is_allowed = match role {
+        "object" => true,
+        "predicate" => kind == TermKind::Iri,
+        _ => kind != TermKind::Literal,
+    };
+    if !is_allowed {
+        return Err(format!("the constant {term} cannot be a {role}"));
+    }
+    Ok(TermMap {
+        value: TermValue::Constant(term.clone()),
+        kind,
+        language: None,
+        datatype: None,
+    })
+}
+
+fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, String> {
+    let expr =
+        parse(written, namespaces).map_err(|what| format!("the reference `{written}`: {what}"))?;
+    Ok(Expression {
+        parts: vec![Part::Value(expr)],
+        is_template: false,
+        written: written.to_owned(),
+    })
+}
+
+/// Reads a template: texts with expressions in braces. A backslash escapes a brace.
+fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, String> {
+    let fault = |what: String| format!("the template `{written}`: {what}");
+    let mut parts = Vec::new();
+    let mut text = String::new();
+    let mut inner: Option<String> = None;
+    let mut characters = written.chars();
+    while let Some(character) = characters.next() {
+        let (character, is_escaped) = match character {
+            '\\' => match characters.next() {
+                Some(next) => (next, true),
+                None => return Err(fault("it ends with a backslash".to_owned())),
+            },
+            other => (other, false),
+        };
+        match (character, is_escaped, &mut inner) {
+            ('{', false, None) => {
+                if !text.is_empty() {
+                    parts.push(Part::Text(std::mem::take(&mut text)));
+                }
+                inner = Some(String::new());
+            }
+            ('}', false, Some(expression)) => {
+                let expr = parse(expression, namespaces)
+                    .map_err(|what| fault(format!("`{expression}`: {what}")))?;
+                parts.push(Part::Value(expr));
+                inner = None;
+            }
+            ('{' | '}', false, _) => {
+                return Err(fault(format!(
+                    "`{character}` has no counterpart; write \\{character} for the character"
+                )));
+            }
+            (_, _, Some(expression)) => expression.push(character),
+            (_, _, None) => text.push(character),
+        }
+    }
+    if inner.is_some() {
+        return Err(fault("`{` has no counterpart".to_owned()));
+    }
+    if !text.is_empty() {
+        parts.push(Part::Text(text));
+    }
+    Ok(Expression {
+        parts,
+        is_template: true,
+        written: written.to_owned(),
+    })
+}
+
+/// Returns whether a text is a language tag. A language of more than three letters is reserved
+/// (RFC 5646, 2.2.1).
+pub(crate) fn is_language(tag: &str) -> bool {
+    let first = tag.split('-').next().unwrap_or_default();
+    let is_private = first.eq_ignore_ascii_case("x") || first.eq_ignore_ascii_case("i");
+    (is_private || matches!(first.len(), 2 | 3))
+        && Literal::new_language_tagged_literal("", tag).is_ok()
+}
+
+/// Returns whether a graph term is the default graph.
+pub(crate) fn is_default_graph(graph: &NamedNode) -> bool {
+    super::local(graph.as_str()) == Some("defaultGraph")
+}
+
+/// Returns a blank node with a number.
+pub(crate) fn blank(number: usize) -> BlankNode {
+    BlankNode::new_unchecked(format!("b{number}"))
+}
+
+fn known(role: &str) -> &'static [&'static str] {
+    match role {
+        "subject" => &[
+            "class",
+            "constant",
+            "graph",
+            "graphMap",
+            "reference",
+            "template",
+            "termType",
+        ],
+        "object" => &[
+            "class",
+            "constant",
+            "datatype",
+            "datatypeMap",
+            "language",
+            "languageMap",
+            "reference",
+            "template",
+            "termType",
+        ],
+        _ => &["class", "constant", "reference", "template", "termType"],
+    }
+}

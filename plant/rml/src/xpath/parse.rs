@@ -1,0 +1,468 @@
+//! The parser of expressions.
+
+use std::sync::Arc;
+
+use super::tokens::{Kind, Token, tokens};
+use super::{
+    Axis, Comparison, Expr, Function, Index, Join, Namespaces, Operator, Path, Space, Start, Step,
+    Test,
+};
+
+/// Parses an expression.
+///
+/// # Errors
+/// A text that names the position and the remedy.
+pub(crate) fn parse(text: &str, namespaces: &Namespaces) -> Result<Expr, String> {
+    if text.len() > MAX_LENGTH {
+        return Err(format!("it has more than {MAX_LENGTH} bytes"));
+    }
+    let mut parser = Parser {
+        tokens: tokens(text)?,
+        next: 0,
+        depth: 0,
+        operators: 0,
+        namespaces,
+    };
+    let expr = parser.expr()?;
+    match parser.tokens.get(parser.next) {
+        None => Ok(expr),
+        Some(token) => Err(format!(
+            "unexpected {} at character {}",
+            shown(&token.kind),
+            token.position
+        )),
+    }
+}
+
+struct Parser<'a> {
+    tokens: Vec<Token>,
+    next: usize,
+    depth: usize,
+    operators: usize,
+    namespaces: &'a Namespaces,
+}
+
+type Parsed<T> = Result<T, String>;
+
+/// The binary operators by precedence, weakest first.
+const LEVELS: [&[&str]; 7] = [
+    &["or"],
+    &["and"],
+    &["=", "!="],
+    &["<", "<=", ">", ">="],
+    &["+", "-"],
+    &["*", "div", "mod"],
+    &["|"],
+];
+/// The level above which a sign may stand.
+const UNARY: usize = 6;
+
+impl Parser<'_> {
+    fn expr(&mut self) -> Parsed<Expr> {
+        self.depth += 1;
+        if self.depth > MAX_DEPTH {
+            return Err(format!("it nests more than {MAX_DEPTH} deep"));
+        }
+        let expr = self.level(0);
+        self.depth -= 1;
+        expr
+    }
+
+    fn level(&mut self, level: usize) -> Parsed<Expr> {
+        if level == UNARY && self.take("-") {
+            self.depth += 1;
+            if self.depth > MAX_DEPTH {
+                return Err(format!("it nests more than {MAX_DEPTH} deep"));
+            }
+            let expr = self.level(UNARY)?;
+            self.depth -= 1;
+            return Ok(Expr::Negate(Box::new(expr)));
+        }
+        let Some(symbols) = LEVELS.get(level) else {
+            return self.path();
+        };
+        let mut left = self.level(level + 1)?;
+        while let Some(symbol) = symbols.iter().copied().find(|symbol| self.take(symbol)) {
+            // The expression nests to the left, and is evaluated by recursion.
+            self.operators += 1;
+            if self.operators > MAX_OPERATORS {
+                return Err(format!("it has more than {MAX_OPERATORS} operators"));
+            }
+            let right = self.level(level + 1)?;
+            left = binary(symbol, left, right);
+        }
+        Ok(left)
+    }
+
+    fn path(&mut self) -> Parsed<Expr> {
+        let mut steps = Vec::new();
+        let start = if self.take("//") {
+            steps.push(any_descendant());
+            self.steps(&mut steps)?;
+            Start::Root
+        } else if self.take("/") {
+            if self.begins_step() {
+                self.steps(&mut steps)?;
+            }
+            Start::Root
+        } else if self.begins_step() {
+            self.steps(&mut steps)?;
+            Start::Context
+        } else {
+            let primary = self.primary()?;
+            let mut predicates = Vec::new();
+            while self.take("[") {
+                predicates.push(self.predicate()?);
+            }
+            let continues = if self.take("//") {
+                steps.push(any_descendant());
+                true
+            } else {
+                self.take("/")
+            };
+            if continues {
+                self.steps(&mut steps)?;
+            } else if predicates.is_empty() {
+                return Ok(primary);
+            }
+            Start::Filter(Box::new(primary), predicates)
+        };
+        let steps = shortened(steps);
+        let index = match start {
+            Start::Root => index(&steps),
+            Start::Context | Start::Filter(..) => None,
+        };
+        Ok(Expr::Path(Box::new(Path {
+            start,
+            steps,
+            index,
+        })))
+    }
+
+    fn steps(&mut self, steps: &mut Vec<Step>) -> Parsed<()> {
+        loop {
+            if steps.len() >= MAX_DEPTH {
+                return Err(format!("the path has more than {MAX_DEPTH} steps"));
+            }
+            let step = self.step()?;
+            steps.push(step);
+            if self.take("//") {
+                steps.push(any_descendant());
+            } else if !self.take("/") {
+                return Ok(());
+            }
+        }
+    }
+
+    fn step(&mut self) -> Parsed<Step> {
+        for (symbol, axis) in [("..", Axis::Parent), (".", Axis::Itself)] {
+            if self.take(symbol) {
+                return Ok(Step {
+                    axis,
+                    test: Test::Node,
+                    predicates: Vec::new(),
+                });
+            }
+        }
+        let axis = self.axis()?;
+        let test = self.test()?;
+        let mut predicates = Vec::new();
+        while self.take("[") {
+            predicates.push(self.predicate()?);
+        }
+        Ok(Step {
+            axis,
+            test,
+            predicates,
+        })
+    }
+
+    fn axis(&mut self) -> Parsed<Axis> {
+        if self.take("@") {
+            return Ok(Axis::Attribute);
+        }
+        let named = match (self.peek(0), self.peek(1)) {
+            (Some(Kind::Name(None, name)), Some(Kind::Symbol("::"))) => name.clone(),
+            _ => return Ok(Axis::Child),
+        };
+        self.next += 2;
+        AXES.iter()
+            .find(|(name, _)| *name == named)
+            .map(|(_, axis)| *axis)
+            .ok_or_else(|| {
+                let known: Vec<&str> = AXES.iter().map(|(name, _)| *name).collect();
+                format!("unknown axis `{named}`; known are {}", known.join(", "))
+            })
+    }
+
+    fn test(&mut self) -> Parsed<Test> {
+        let Some(Kind::Name(prefix, local)) = self.peek(0).cloned() else {
+            return Err(self.wrong("the name of an element or attribute"));
+        };
+        self.next += 1;
+        if prefix.is_none() && self.take("(") {
+            let target = match self.peek(0).cloned() {
+                Some(Kind::Text(text)) if local == "processing-instruction" => {
+                    self.next += 1;
+                    Some(text)
+                }
+                _ => None,
+            };
+            self.expect(")")?;
+            return match local.as_str() {
+                "node" => Ok(Test::Node),
+                "text" => Ok(Test::Text),
+                "comment" => Ok(Test::Comment),
+                "processing-instruction" => Ok(Test::Instruction(target)),
+                _ => Err(format!(
+                    "`{local}(..)` is not a test of a node; a function can only start a path"
+                )),
+            };
+        }
+        let space = match prefix {
+            None if local == "*" || self.namespaces.is_empty() => Space::Any,
+            None => Space::None,
+            Some(prefix) => {
+                let declared = self.namespaces.iter().find(|(known, _)| *known == prefix);
+                match declared {
+                    Some((_, uri)) => Space::Uri(uri.clone()),
+                    None => Space::OfDocument(prefix),
+                }
+            }
+        };
+        Ok(Test::Name(space, (local != "*").then_some(local)))
+    }
+
+    fn predicate(&mut self) -> Parsed<Expr> {
+        let expr = self.expr()?;
+        self.expect("]")?;
+        Ok(expr)
+    }
+
+    fn primary(&mut self) -> Parsed<Expr> {
+        if self.take("(") {
+            let expr = self.expr()?;
+            self.expect(")")?;
+            return Ok(expr);
+        }
+        match self.peek(0).cloned() {
+            Some(Kind::Text(text)) => {
+                self.next += 1;
+                Ok(Expr::Text(text))
+            }
+            Some(Kind::Number(number)) => {
+                self.next += 1;
+                Ok(Expr::Number(number))
+            }
+            Some(Kind::Name(prefix, name)) => {
+                self.next += 2;
+                self.call(prefix, &name)
+            }
+            Some(Kind::Symbol(_)) | None => Err(self.wrong("a path, a text or a number")),
+        }
+    }
+
+    /// Parses the arguments of a function behind its bracket.
+    fn call(&mut self, prefix: Option<String>, name: &str) -> Parsed<Expr> {
+        // The functions of XPath 2 and later have the prefix `fn` in some mappings.
+        let known = Function::ALL.iter().find(|(known, ..)| *known == name);
+        let known = known.filter(|_| prefix.is_none_or(|prefix| prefix == "fn"));
+        let Some((_, function, least, most)) = known.copied() else {
+            let all: Vec<&str> = Function::ALL.iter().map(|(name, ..)| *name).collect();
+            return Err(format!(
+                "unknown function `{name}`; known are {}",
+                all.join(", ")
+            ));
+        };
+        let mut all = Vec::new();
+        if !self.take(")") {
+            loop {
+                all.push(self.expr()?);
+                if !self.take(",") {
+                    break;
+                }
+            }
+            self.expect(")")?;
+        }
+        if all.len() < least || all.len() > most {
+            return Err(format!(
+                "`{name}` takes from {least} to {most} arguments, and has {}",
+                all.len()
+            ));
+        }
+        Ok(Expr::Call(function, all))
+    }
+
+    /// Returns whether the next token begins a step, and not a function.
+    fn begins_step(&self) -> bool {
+        match (self.peek(0), self.peek(1)) {
+            (Some(Kind::Symbol("@" | "." | "..")), _) => true,
+            (Some(Kind::Name(None, name)), Some(Kind::Symbol("("))) => {
+                ["node", "text", "comment", "processing-instruction"].contains(&name.as_str())
+            }
+            (Some(Kind::Name(Some(_), _)), Some(Kind::Symbol("("))) => false,
+            (Some(Kind::Name(..)), _) => true,
+            _ => false,
+        }
+    }
+
+    fn peek(&self, ahead: usize) -> Option<&Kind> {
+        self.tokens.get(self.next + ahead).map(|token| &token.kind)
+    }
+
+    fn take(&mut self, symbol: &str) -> bool {
+        let found = matches!(self.peek(0), Some(Kind::Symbol(next)) if *next == symbol);
+        self.next += usize::from(found);
+        found
+    }
+
+    fn expect(&mut self, symbol: &str) -> Parsed<()> {
+        match self.take(symbol) {
+            true => Ok(()),
+            false => Err(self.wrong(&format!("`{symbol}`"))),
+        }
+    }
+
+    fn wrong(&self, expected: &str) -> String {
+        match self.tokens.get(self.next) {
+            Some(token) => format!(
+                "expected {expected}, and found {} at character {}",
+                shown(&token.kind),
+                token.position
+            ),
+            None => format!("expected {expected} at the end"),
+        }
+    }
+}
+
+fn binary(symbol: &str, left: Expr, right: Expr) -> Expr {
+    let (left, right) = (Box::new(left), Box::new(right));
+    match symbol {
+        "or" => Expr::Or(left, right),
+        "and" => Expr::And(left, right),
+        "|" => Expr::Union(left, right),
+        "=" => Expr::Compare(Comparison::Equal, left, right),
+        "!=" => Expr::Compare(Comparison::NotEqual, left, right),
+        "<" => Expr::Compare(Comparison::Less, left, right),
+        "<=" => Expr::Compare(Comparison::LessOrEqual, left, right),
+        ">" => Expr::Compare(Comparison::Greater, left, right),
+        ">=" => Expr::Compare(Comparison::GreaterOrEqual, left, right),
+        "+" => Expr::Calculate(Operator::Add, left, right),
+        "-" => Expr::Calculate(Operator::Subtract, left, right),
+        "*" => Expr::Calculate(Operator::Multiply, left, right),
+        "div" => Expr::Calculate(Operator::Divide, left, right),
+        _ => Expr::Calculate(Operator::Remainder, left, right),
+    }
+}
+
+fn any_descendant() -> Step {
+    Step {
+        axis: Axis::DescendantOrSelf,
+        test: Test::Node,
+        predicates: Vec::new(),
+    }
+}
+
+/// Splits predicates with `and`, and turns `//name` into one step. Both change no result, because
+/// no predicate of such a step depends on a position.
+fn shortened(steps: Vec<Step>) -> Vec<Step> {
+    let mut all: Vec<Step> = Vec::new();
+    for mut step in steps {
+        if !step.predicates.iter().any(Expr::is_positional) {
+            step.predicates = step.predicates.into_iter().flat_map(conjuncts).collect();
+            if step.axis == Axis::Child && all.last() == Some(&any_descendant()) {
+                all.pop();
+                step.axis = Axis::Descendant;
+            }
+        }
+        all.push(step);
+    }
+    all
+}
+
+fn conjuncts(expr: Expr) -> Vec<Expr> {
+    // A part of a conjunction may be a number, which is no position inside of it.
+    if let Expr::And(a, b) = expr {
+        if a.is_positional() || b.is_positional() {
+            return vec![Expr::And(a, b)];
+        }
+        let mut all = conjuncts(*a);
+        all.extend(conjuncts(*b));
+        return all;
+    }
+    vec![expr]
+}
+
+/// Returns the index of an absolute path.
+fn index(steps: &[Step]) -> Option<Index> {
+    let fixed = steps.iter().take_while(|step| !step.has_current()).count();
+    let leading = steps.get(..fixed)?;
+    let key = format!("{leading:?}");
+    let join = steps
+        .get(fixed)
+        .and_then(|step| join(&key, step))
+        .map(Box::new);
+    Some(Index {
+        key: key.into(),
+        steps: fixed,
+        join,
+    })
+}
+
+fn join(before: &str, step: &Step) -> Option<Join> {
+    if step.predicates.iter().any(Expr::is_positional) {
+        return None;
+    }
+    let is_candidate = |expr: &Expr| !expr.has_current() && !expr.is_outer() && expr.is_textual();
+    let is_probe = |expr: &Expr| expr.is_outer() && expr.is_textual();
+    let found = step.predicates.iter().enumerate().find_map(|(at, one)| {
+        let Expr::Compare(Comparison::Equal, a, b) = one else {
+            return None;
+        };
+        if is_candidate(a) && is_probe(b) {
+            Some((at, a, b))
+        } else if is_candidate(b) && is_probe(a) {
+            Some((at, b, a))
+        } else {
+            None
+        }
+    });
+    let (at, candidate, probe) = found?;
+    let rest = step.predicates.iter().enumerate();
+    let rest = rest.filter(|(other, _)| *other != at);
+    let key = format!("{before}{:?}{:?}{candidate:?}", step.axis, step.test);
+    Some(Join {
+        key: Arc::from(key),
+        candidate: (**candidate).clone(),
+        probe: (**probe).clone(),
+        rest: rest.map(|(_, one)| one.clone()).collect(),
+    })
+}
+
+fn shown(kind: &Kind) -> String {
+    match kind {
+        Kind::Number(number) => format!("`{number}`"),
+        Kind::Text(text) => format!("the text `{text}`"),
+        Kind::Name(None, name) => format!("`{name}`"),
+        Kind::Name(Some(prefix), name) => format!("`{prefix}:{name}`"),
+        Kind::Symbol(symbol) => format!("`{symbol}`"),
+    }
+}
+
+const AXES: [(&str, Axis); 12] = [
+    ("ancestor", Axis::Ancestor),
+    ("ancestor-or-self", Axis::AncestorOrSelf),
+    ("attribute", Axis::Attribute),
+    ("child", Axis::Child),
+    ("descendant", Axis::Descendant),
+    ("descendant-or-self", Axis::DescendantOrSelf),
+    ("following", Axis::Following),
+    ("following-sibling", Axis::FollowingSibling),
+    ("parent", Axis::Parent),
+    ("preceding", Axis::Preceding),
+    ("preceding-sibling", Axis::PrecedingSibling),
+    ("self", Axis::Itself),
+];
+const MAX_DEPTH: usize = 64;
+const MAX_OPERATORS: usize = 256;
+const MAX_LENGTH: usize = 16 << 10;

@@ -1,0 +1,114 @@
+//! The tokens of an expression (XPath 1.0, 3.7).
+
+/// A token with the position of its first character, from 1.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Token {
+    pub(super) kind: Kind,
+    pub(super) position: usize,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Kind {
+    Number(f64),
+    Text(String),
+    /// A name, which may have a prefix. The local name may be `*`.
+    Name(Option<String>, String),
+    /// A symbol, or one of the operators `and`, `or`, `div` and `mod`.
+    Symbol(&'static str),
+}
+
+/// The symbols, longer ones first.
+const SYMBOLS: [&str; 21] = [
+    "::", "//", "..", "!=", "<=", ">=", "(", ")", "[", "]", "@", ",", "/", "|", "+", "-", "=", "<",
+    ">", ".", "$",
+];
+
+/// Splits an expression into tokens.
+pub(super) fn tokens(text: &str) -> Result<Vec<Token>, String> {
+    let mut all: Vec<Token> = Vec::new();
+    let mut rest = text;
+    loop {
+        rest = rest.trim_start();
+        let Some(first) = rest.chars().next() else {
+            return Ok(all);
+        };
+        let before = text.get(..text.len() - rest.len()).unwrap_or_default();
+        let position = before.chars().count() + 1;
+        let (kind, after) = one(rest, first, all.last().map(|token| &token.kind))
+            .map_err(|what| format!("{what} at character {position}"))?;
+        all.push(Token { kind, position });
+        rest = after;
+    }
+}
+
+fn one<'a>(rest: &'a str, first: char, before: Option<&Kind>) -> Result<(Kind, &'a str), String> {
+    if let quote @ ('"' | '\'') = first {
+        let inner = rest.get(1..).unwrap_or_default();
+        let (text, after) = inner
+            .split_once(quote)
+            .ok_or_else(|| format!("the text has no closing {quote}"))?;
+        return Ok((Kind::Text(text.to_owned()), after));
+    }
+    let fraction = rest.strip_prefix('.').and_then(|rest| rest.chars().next());
+    if first.is_ascii_digit() || fraction.is_some_and(|digit| digit.is_ascii_digit()) {
+        let end = rest.find(|c: char| !c.is_ascii_digit() && c != '.');
+        let (number, after) = rest.split_at(end.unwrap_or(rest.len()));
+        let number = number
+            .parse()
+            .map_err(|_| format!("`{number}` is not a number"))?;
+        return Ok((Kind::Number(number), after));
+    }
+    if first == '*' {
+        let after = rest.get(1..).unwrap_or_default();
+        return Ok(match ends_operand(before) {
+            true => (Kind::Symbol("*"), after),
+            false => (Kind::Name(None, "*".to_owned()), after),
+        });
+    }
+    if let Some(symbol) = SYMBOLS.iter().find(|symbol| rest.starts_with(**symbol)) {
+        if *symbol == "$" {
+            return Err("variables are not supported; write the value".to_owned());
+        }
+        return Ok((
+            Kind::Symbol(symbol),
+            rest.get(symbol.len()..).unwrap_or_default(),
+        ));
+    }
+    let (name, after) = name(rest).ok_or_else(|| format!("unexpected character `{first}`"))?;
+    if ends_operand(before) {
+        let operator = ["and", "or", "div", "mod"];
+        let Some(operator) = operator.into_iter().find(|operator| *operator == name) else {
+            return Err(format!("an operator is missing before `{name}`"));
+        };
+        return Ok((Kind::Symbol(operator), after));
+    }
+    // A colon is part of the name unless the name is an axis.
+    if let Some(local) = after
+        .strip_prefix(':')
+        .filter(|rest| !rest.starts_with(':'))
+    {
+        if let Some(after) = local.strip_prefix('*') {
+            return Ok((Kind::Name(Some(name.to_owned()), "*".to_owned()), after));
+        }
+        let (local, after) =
+            self::name(local).ok_or_else(|| format!("no name follows the prefix `{name}`"))?;
+        return Ok((Kind::Name(Some(name.to_owned()), local.to_owned()), after));
+    }
+    Ok((Kind::Name(None, name.to_owned()), after))
+}
+
+fn name(text: &str) -> Option<(&str, &str)> {
+    let is_part = |c: char| c.is_alphanumeric() || matches!(c, '_' | '-' | '.' | '\u{b7}');
+    let end = text.find(|c| !is_part(c)).unwrap_or(text.len());
+    let starts = text.starts_with(|c: char| c.is_alphabetic() || c == '_');
+    starts.then(|| text.split_at(end))
+}
+
+/// Returns whether an operator may follow.
+fn ends_operand(before: Option<&Kind>) -> bool {
+    match before {
+        None => false,
+        Some(Kind::Number(_) | Kind::Text(_) | Kind::Name(..)) => true,
+        Some(Kind::Symbol(symbol)) => matches!(*symbol, ")" | "]" | "." | ".."),
+    }
+}
