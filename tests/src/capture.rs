@@ -1,7 +1,7 @@
 //! Captures of UADP datagrams, and their dissection by Wireshark with the dissector of this
 //! project.
 
-use std::{fmt::Write as _, fs, process::Command};
+use std::{fmt::Write as _, fs, path::Path, process::Command};
 
 use serde_json::Value;
 
@@ -135,9 +135,18 @@ impl Cell {
     fn tshark(&self, capture: &Capture, args: &[&str]) -> String {
         let path = self.folder().join("datagrams.pcap");
         fs::write(&path, capture.bytes()).unwrap();
+        self.tshark_of(&path, args)
+    }
+
+    /// Returns the output of tshark for a capture file.
+    ///
+    /// # Panics
+    /// Panics as [`dissect`](Self::dissect) does.
+    #[must_use]
+    pub fn tshark_of(&self, file: &Path, args: &[&str]) -> String {
         let output = Command::new(TSHARK)
             .arg("-r")
-            .arg(&path)
+            .arg(file)
             .args(["-X", &format!("lua_script:{DISSECTOR}")])
             .args(args)
             // The configuration of the machine's user and its plugins must not take part.

@@ -34,6 +34,7 @@ mod peers;
 mod plug_and_produce;
 mod pure_crates;
 mod rate;
+mod recording;
 mod reload;
 mod ros1;
 mod ros1_actionlib;

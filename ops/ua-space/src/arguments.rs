@@ -3,6 +3,7 @@
 mod cell;
 mod discover;
 mod live;
+mod recording;
 
 pub(crate) use cell::{Doctor, New, StatusArguments, Template};
 pub(crate) use discover::{Discover, Look};
@@ -10,6 +11,7 @@ pub(crate) use live::{
     Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, Skills, SkillsVerb, Source,
     SourceAt, SourceVerb, Target, Top, Trace, Types, WatchSkills,
 };
+pub(crate) use recording::{Record, Replay, Viewers};
 
 use std::path::PathBuf;
 
@@ -198,6 +200,36 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 69 a program does not answer, or an interface or group is not
     /// available, 74 the output cannot be written.
     Trace(Trace),
+    /// Record the messages of a running space: all as pcapng, or the values as MCAP
+    ///
+    /// A .pcapng file has each message as it was received, with its time in nanoseconds; Wireshark,
+    /// tshark and `ua-space decode`, `replay` read it. Messages of a secured group stay encrypted;
+    /// keys are never in the file. An .mcap file has the values as ROS messages, or as JSON without
+    /// a ROS type. Ctrl-C ends a recording whole.
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 an interface or group is not available, 74 the file exists
+    /// or cannot be written; what was written before is whole.
+    Record(Record),
+    /// Send a recording into a group again, with its intervals
+    ///
+    /// Values and their descriptions are sent as recorded; their times are moved to the present.
+    /// Commands and calls are left out unless --commands is given: values of the OPC UA side,
+    /// values that act where they arrive, values without a description, and requests. A group with
+    /// live programs of the same spaces is refused unless --onto-live is given.
+    ///
+    /// Exit codes: 0 done, 1 live programs of the same spaces were found, 64 usage, 65 the file is
+    /// malformed or has nothing to send, 69 an interface or group is not available, 74 the file
+    /// cannot be read, 130 interrupted.
+    Replay(Replay),
+    /// Show the values of a running space in viewers of robot data, as Lichtblick or Foxglove
+    ///
+    /// Serves the Foxglove WebSocket protocol at ws://127.0.0.1:8765 (`foxglove.sdk.v1` and
+    /// `foxglove.websocket.v1`), read-only and without ROS. Values are ROS messages, or JSON
+    /// without a ROS type. A viewer that reads too slowly loses its oldest values.
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 the port, an interface or group is not available, 74 the
+    /// output cannot be written.
+    Live(Viewers),
     /// Serve the page of the cell in a browser, read-only and without a server
     ///
     /// The page is at http://127.0.0.1:8090/ unless --metrics names another address. The mapping

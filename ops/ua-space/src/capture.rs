@@ -1,5 +1,9 @@
 //! Reads the packets of a capture file in order: pcap in all its variants (draft-ietf-opsawg-pcap)
-//! and pcapng (draft-ietf-opsawg-pcapng).
+//! and pcapng (draft-ietf-opsawg-pcapng). `write` writes pcapng.
+
+mod write;
+
+pub(crate) use write::{Link, PcapNg};
 
 use std::io::{self, Read};
 
@@ -404,6 +408,7 @@ const SECTION_HEADER: [u8; 4] = [0x0A, 0x0D, 0x0D, 0x0A];
 /// The byte-order magic of a section written by a big-endian machine.
 const BYTE_ORDER: [u8; 4] = [0x1A, 0x2B, 0x3C, 0x4D];
 const INTERFACE_DESCRIPTION: u32 = 1;
+const INTERFACE_STATISTICS: u32 = 5;
 const SIMPLE_PACKET: u32 = 3;
 const ENHANCED_PACKET: u32 = 6;
 const END_OF_OPTIONS: u16 = 0;

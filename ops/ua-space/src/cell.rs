@@ -8,6 +8,7 @@ mod processes;
 pub(crate) use doctor::doctor;
 pub(crate) use overview::status;
 pub(crate) use pages::Page;
+pub(crate) use processes::own_drops;
 
 /// Returns the status pages of the programs on this host.
 pub(crate) async fn pages_of_this_host() -> Vec<Page> {

@@ -6,6 +6,7 @@ mod bandwidth;
 mod book;
 mod call;
 mod carrier;
+mod channels;
 mod described;
 mod echo;
 mod list;
@@ -13,9 +14,12 @@ mod names;
 mod parameters;
 mod plain;
 mod prober;
+mod record;
+mod replay;
 mod run;
 mod sealing;
 mod seen;
+mod serve;
 mod skills;
 mod structure;
 mod text;
@@ -29,7 +33,10 @@ pub(crate) use call::call;
 pub(crate) use carrier::broker_mapping;
 pub(crate) use echo::{echo, hz};
 pub(crate) use list::{info, json};
+pub(crate) use record::record;
+pub(crate) use replay::replay;
 pub(crate) use seen::{Timing, TopicSeen, listened};
+pub(crate) use serve::serve;
 pub(crate) use skills::{HeardNames, heard_names, skills, types};
 pub(crate) use text::{Table, harmless, is_coloured, wrapped};
 pub(crate) use top::{Sort, top};
@@ -78,6 +85,17 @@ pub(crate) enum Ended {
     Time,
     /// The closure requested the end.
     Enough,
+    /// SIGINT or SIGTERM.
+    Interrupted,
+}
+
+/// The result of waiting for a datagram.
+#[derive(Debug, Clone, Copy)]
+enum Incoming {
+    /// A datagram is in the buffer.
+    Message(Received),
+    /// The time is over.
+    Nothing,
     /// SIGINT or SIGTERM.
     Interrupted,
 }
@@ -206,8 +224,7 @@ impl Live {
         if self.carrier.within().is_none() {
             return NetworkHeader::default();
         }
-        let elapsed = i128::try_from(self.now().as_nanos()).unwrap_or(i128::MAX);
-        let now = Timestamp::from_unix_nanos(self.start_utc.saturating_add(elapsed));
+        let now = Timestamp::from_unix_nanos(self.utc(self.now()));
         NetworkHeader {
             timestamp: Some(now.time),
             picoseconds: Some(now.picoseconds),
@@ -247,8 +264,7 @@ impl Live {
             let now = self.now();
             if now >= asked {
                 asked = now + LOOK;
-                self.ask_for_all(now);
-                self.probe_what_is_due(now);
+                self.probe(now);
             }
             if now >= until {
                 return match self.carrier.lost() {
@@ -268,20 +284,49 @@ impl Live {
         until: Duration,
         each: &mut dyn FnMut(News<'_>, Duration) -> Go,
     ) -> Result<Option<Ended>, Failure> {
+        match self.receive(until).await? {
+            Incoming::Interrupted => Ok(Some(Ended::Interrupted)),
+            Incoming::Nothing => Ok(None),
+            Incoming::Message(Received { length, from }) => {
+                let datagram = self.buffer.get(..length).unwrap_or_default();
+                let read = (&mut self.book, self.sealing.as_mut());
+                Ok(take(read, (datagram, from), self.start.elapsed(), each))
+            }
+        }
+    }
+
+    /// Receives one datagram into the buffer, or waits until the given time.
+    async fn receive(&mut self, until: Duration) -> Result<Incoming, Failure> {
         let until = self.start + until;
         tokio::select! {
             biased;
-            Some(()) = self.interrupt.recv() => Ok(Some(Ended::Interrupted)),
-            Some(()) = self.terminate.recv() => Ok(Some(Ended::Interrupted)),
-            () = tokio::time::sleep_until(until) => Ok(None),
-            received = self.carrier.recv(&mut self.buffer) => {
-                let Received { length, from } = received
-                    .map_err(|error| Failure::Io(format!("cannot hear the group: {error}")))?;
-                let datagram = self.buffer.get(..length).unwrap_or_default();
-                let sealing = self.sealing.as_mut();
-                Ok(take((&mut self.book, sealing), (datagram, from), self.start.elapsed(), each))
-            }
+            Some(()) = self.interrupt.recv() => Ok(Incoming::Interrupted),
+            Some(()) = self.terminate.recv() => Ok(Incoming::Interrupted),
+            () = tokio::time::sleep_until(until) => Ok(Incoming::Nothing),
+            received = self.carrier.recv(&mut self.buffer) => received
+                .map(Incoming::Message)
+                .map_err(|error| Failure::Io(format!("cannot hear the group: {error}"))),
         }
+    }
+
+    /// Returns whether an address is the source of own messages.
+    fn is_own(&self, from: SocketAddr) -> bool {
+        self.carrier.source().is_some_and(|source| {
+            let ip = source.ip();
+            source.port() == from.port() && (ip.is_unspecified() || ip == from.ip())
+        })
+    }
+
+    /// Returns the nanoseconds since 1970 at a time since the group was joined.
+    fn utc(&self, now: Duration) -> i128 {
+        let elapsed = i128::try_from(now.as_nanos()).unwrap_or(i128::MAX);
+        self.start_utc.saturating_add(elapsed)
+    }
+
+    /// Sends the probes that are due.
+    fn probe(&mut self, now: Duration) {
+        self.ask_for_all(now);
+        self.probe_what_is_due(now);
     }
 
     /// Probes for all topics that have values but no description.

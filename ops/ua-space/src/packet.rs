@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, SocketAddrV4};
 
 /// A UDP datagram.
 #[derive(Debug, PartialEq, Eq)]
@@ -28,6 +28,9 @@ pub(crate) enum Found<'a> {
 
 /// Extracts the UDP datagram of a packet.
 pub(crate) fn udp<'a>(link_type: u16, data: &'a [u8], fragments: &mut Fragments) -> Found<'a> {
+    if link_type == EXPORTED {
+        return exported(data);
+    }
     let packet = match link_type {
         ETHERNET => ethernet(data),
         RAW | RAW_BSD | RAW_OPENBSD | IPV4 | IPV6 => Some(data),
@@ -61,6 +64,68 @@ pub(crate) fn udp<'a>(link_type: u16, data: &'a [u8], fragments: &mut Fragments)
             }
         }
     }
+}
+
+/// Returns the NetworkMessage of an exported PDU, which has no addresses.
+fn exported(mut data: &[u8]) -> Found<'_> {
+    let nowhere = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
+    let mut is_uadp = false;
+    while let Some((&[a, b, c, d], rest)) = data.split_first_chunk() {
+        let length = usize::from(u16::from_be_bytes([c, d]));
+        match u16::from_be_bytes([a, b]) {
+            END_OF_TAGS if is_uadp => {
+                return Found::Udp(Udp {
+                    source: nowhere,
+                    destination: nowhere,
+                    payload: Cow::Borrowed(rest),
+                    missing: 0,
+                });
+            }
+            END_OF_TAGS => return Found::Other,
+            DISSECTOR => is_uadp = rest.get(..length).is_some_and(|name| name == UADP),
+            _ => {}
+        }
+        data = rest.get(length..).unwrap_or_default();
+    }
+    Found::Other
+}
+
+/// Returns the tags before the NetworkMessage in an exported PDU.
+pub(crate) fn exported_head() -> Vec<u8> {
+    let tag = |tag: u16, value: &[u8]| {
+        let length = u16::try_from(value.len()).unwrap_or_default();
+        [&tag.to_be_bytes()[..], &length.to_be_bytes(), value].concat()
+    };
+    [tag(DISSECTOR, UADP), tag(END_OF_TAGS, &[])].concat()
+}
+
+/// Returns the headers of IPv4 and UDP of a datagram, without a checksum of UDP.
+pub(crate) fn ipv4_head(
+    (from, to): (SocketAddrV4, SocketAddrV4),
+    identification: u16,
+    length: usize,
+) -> Vec<u8> {
+    let length = |headers: usize| u16::try_from(length + headers).unwrap_or(u16::MAX);
+    let mut head = vec![0x45, 0];
+    head.extend(length(28).to_be_bytes());
+    head.extend(identification.to_be_bytes());
+    head.extend([0, 0, 1, UDP, 0, 0]);
+    head.extend(from.ip().octets());
+    head.extend(to.ip().octets());
+    let (words, _) = head.as_chunks();
+    let sum: u32 = words
+        .iter()
+        .map(|word| u32::from(u16::from_be_bytes(*word)))
+        .sum();
+    let folded = (sum & 0xFFFF) + (sum >> 16);
+    let checksum = !u16::try_from((folded & 0xFFFF) + (folded >> 16)).unwrap_or_default();
+    if let Some(place) = head.get_mut(10..12) {
+        place.copy_from_slice(&checksum.to_be_bytes());
+    }
+    for part in [from.port(), to.port(), length(8), 0] {
+        head.extend(part.to_be_bytes());
+    }
+    head
 }
 
 /// Fragments of incomplete IP datagrams.
@@ -335,12 +400,19 @@ const NULL: u16 = 0;
 const ETHERNET: u16 = 1;
 const RAW_BSD: u16 = 12;
 const RAW_OPENBSD: u16 = 14;
-const RAW: u16 = 101;
+pub(crate) const RAW: u16 = 101;
 const LOOP: u16 = 108;
 const LINUX_SLL: u16 = 113;
 const IPV4: u16 = 228;
 const IPV6: u16 = 229;
 const LINUX_SLL2: u16 = 276;
+/// A PDU that names its dissector.
+pub(crate) const EXPORTED: u16 = 252;
+
+/// The tags of an exported PDU.
+const END_OF_TAGS: u16 = 0;
+const DISSECTOR: u16 = 12;
+const UADP: &[u8] = b"uadp";
 
 /// Protocol numbers of IP.
 const HOP_BY_HOP: u8 = 0;

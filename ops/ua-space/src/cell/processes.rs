@@ -100,19 +100,31 @@ fn pids(proc: &Path) -> Vec<u32> {
 fn owners(proc: &Path) -> BTreeMap<u64, u32> {
     let mut owners = BTreeMap::new();
     for pid in pids(proc) {
-        let folder = proc.join(pid.to_string()).join("fd");
-        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-            let target = fs::read_link(entry.path()).unwrap_or_default();
-            let inode = target.to_str().and_then(|text| {
-                let inode = text.strip_prefix("socket:[")?.strip_suffix(']')?;
-                inode.parse().ok()
-            });
-            if let Some(inode) = inode {
-                owners.entry(inode).or_insert(pid);
-            }
+        for inode in open_sockets(&proc.join(pid.to_string())) {
+            owners.entry(inode).or_insert(pid);
         }
     }
     owners
+}
+
+/// Returns the inodes of the open sockets of a process.
+fn open_sockets(process: &Path) -> impl Iterator<Item = u64> {
+    let entries = fs::read_dir(process.join("fd")).into_iter().flatten();
+    entries.flatten().filter_map(|entry| {
+        let target = fs::read_link(entry.path()).ok()?;
+        let inode = target.to_str()?.strip_prefix("socket:[")?;
+        inode.strip_suffix(']')?.parse().ok()
+    })
+}
+
+/// Returns the number of datagrams that the kernel dropped because a UDP socket of this process was
+/// full.
+pub(crate) fn own_drops() -> u64 {
+    let proc = Path::new("/proc");
+    let own: BTreeSet<u64> = open_sockets(&proc.join("self")).collect();
+    let rows = sockets(proc, "udp").into_iter();
+    let rows = rows.filter(|row| own.contains(&row.inode));
+    rows.map(|row| row.drops).sum()
 }
 
 /// Returns the name of a program of this project from its command line.

@@ -551,7 +551,7 @@ fn quality(message: &DataSetMessage<'_>) -> StatusCode {
 }
 
 /// The bit of a StatusCode that marks the severity Bad.
-const BAD: u32 = 0x8000_0000;
+pub(super) const BAD: u32 = 0x8000_0000;
 const MOST_TOPICS: usize = 16_384;
 const MOST_APPLICATIONS: usize = 1_024;
 /// Maximum size of all descriptions, in bytes.

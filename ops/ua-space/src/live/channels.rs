@@ -1,0 +1,390 @@
+//! The topics of a group as channels of robot data: ROS messages where the writer announces a ROS
+//! type whose definition is known, JSON otherwise.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_core::decode_fields;
+use bridge_node::{Definitions, Environment, TypePaths};
+use mappings::{SpaceId, TopicId};
+use messages::{Dialect, Leaf, MessageType, Plan, Rank, Selection, TypeName, Wire};
+use serde_json::{Map, Value, json};
+use uadp::{BuiltinType, DataSetMessage, MessageKind, Scalar, Variant};
+
+use super::described::{Described, Field, What};
+use super::plain;
+
+/// The channels of all topics with values. A topic with a changed description gets a new channel.
+pub(super) struct Channels {
+    topics: BTreeMap<TopicId, Slot>,
+    /// The names of the channels, and the topics that use them.
+    names: BTreeMap<String, TopicId>,
+    ros1: Definitions,
+    ros2: Definitions,
+    /// The id of the last channel.
+    last: u16,
+    /// ROS types without a usable definition.
+    unknown: BTreeSet<String>,
+}
+
+struct Slot {
+    /// The time of the first value without a description.
+    first: Duration,
+    described: Option<Arc<Described>>,
+    channel: Option<Arc<Channel>>,
+}
+
+/// The values of a topic in one form.
+#[derive(Debug)]
+pub(super) struct Channel {
+    /// From 1 on.
+    pub(super) id: u16,
+    /// The ROS topic, or the name of the value, or the topic of the space.
+    pub(super) name: String,
+    /// The encoding of the messages: `cdr`, `ros1` or `json`.
+    pub(super) encoding: &'static str,
+    pub(super) schema_name: String,
+    /// The language of the schema: `ros2msg`, `ros1msg` or `jsonschema`.
+    pub(super) schema_encoding: &'static str,
+    pub(super) schema: String,
+    /// Further information for users.
+    pub(super) metadata: BTreeMap<String, String>,
+    form: Form,
+    described: Option<Arc<Described>>,
+}
+
+#[derive(Debug)]
+enum Form {
+    /// The fields form a ROS message.
+    Ros(Box<Plan>),
+    /// The only field is the ROS message as on the wire.
+    Bytes,
+    Json,
+}
+
+/// The reason why a value is not in its channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Unfit {
+    /// The writer is asked for the description.
+    Undescribed,
+    /// The number of channels is limited.
+    Channels,
+    /// The value does not match the announced description, or cannot be decoded.
+    Mismatch,
+}
+
+impl Unfit {
+    /// Returns the text for output.
+    pub(super) const fn label(self) -> &'static str {
+        match self {
+            Self::Undescribed => "values before the description of their topic",
+            Self::Channels => "values of more topics than there are channels",
+            Self::Mismatch => "values that do not match the description of their topic",
+        }
+    }
+}
+
+impl Channels {
+    /// Creates the channels with the definitions of ROS types of this host.
+    pub(super) fn new() -> Self {
+        let definitions = |dialect| {
+            let none = Arc::new(TypePaths::default());
+            Definitions::new(dialect, none, Environment::from_env())
+        };
+        Self {
+            topics: BTreeMap::new(),
+            names: BTreeMap::new(),
+            ros1: definitions(Dialect::Ros1),
+            ros2: definitions(Dialect::Ros2),
+            last: 0,
+            unknown: BTreeSet::new(),
+        }
+    }
+
+    /// Returns the channel of a value with this description, and makes it first if needed. A value
+    /// without a description gets a channel only some time after the first value of its topic.
+    ///
+    /// # Errors
+    /// [`Unfit`] if there is no channel.
+    pub(super) fn channel(
+        &mut self,
+        topic: TopicId,
+        described: Option<&Arc<Described>>,
+        now: Duration,
+    ) -> Result<Arc<Channel>, Unfit> {
+        let slot = self.topics.entry(topic).or_insert(Slot {
+            first: now,
+            described: None,
+            channel: None,
+        });
+        if let Some(channel) = &slot.channel
+            && is_same(slot.described.as_ref(), described)
+        {
+            return Ok(Arc::clone(channel));
+        }
+        if described.is_none() && now < slot.first + DESCRIBED_WITHIN {
+            return Err(Unfit::Undescribed);
+        }
+        let id = self.last.checked_add(1).ok_or(Unfit::Channels)?;
+        self.last = id;
+        let channel = Arc::new(self.make(id, topic, described));
+        if let Some(slot) = self.topics.get_mut(&topic) {
+            slot.described = described.map(Arc::clone);
+            slot.channel = Some(Arc::clone(&channel));
+        }
+        Ok(channel)
+    }
+
+    /// Returns the ROS types that are recorded as JSON because their definitions are missing or
+    /// differ.
+    pub(super) const fn unknown(&self) -> &BTreeSet<String> {
+        &self.unknown
+    }
+
+    fn make(&mut self, id: u16, topic: TopicId, described: Option<&Arc<Described>>) -> Channel {
+        let ros = described.and_then(|described| self.ros(topic, described));
+        let mut metadata = BTreeMap::from([
+            ("topic".to_owned(), topic.to_string()),
+            ("space".to_owned(), topic.space.to_string()),
+        ]);
+        if let Some(name) = described.map(|described| &described.name) {
+            metadata.insert("name".to_owned(), name.clone());
+        }
+        let name = self.name(topic, described.map(AsRef::as_ref), ros.is_some());
+        let described = described.map(Arc::clone);
+        match ros {
+            Some(Ros { message, form }) => {
+                let is_ros1 = message.dialect() == Dialect::Ros1;
+                let (encoding, schema_encoding, schema_name) = match is_ros1 {
+                    true => ("ros1", "ros1msg", message.name().to_string()),
+                    false => ("cdr", "ros2msg", message.name().ros2()),
+                };
+                Channel {
+                    id,
+                    name,
+                    encoding,
+                    schema_name,
+                    schema_encoding,
+                    schema: message.definition().to_owned(),
+                    metadata,
+                    form,
+                    described,
+                }
+            }
+            None => Channel {
+                id,
+                name,
+                encoding: "json",
+                schema_name: topic.to_string(),
+                schema_encoding: "jsonschema",
+                schema: schema(described.as_deref()).to_string(),
+                metadata,
+                form: Form::Json,
+                described,
+            },
+        }
+    }
+
+    /// Returns the ROS message of a value; `None` if its definition is not known.
+    fn ros(&mut self, topic: TopicId, described: &Described) -> Option<Ros> {
+        let name: TypeName = described.ros_type()?.parse().ok()?;
+        let told = described.description.split(';').next().unwrap_or_default();
+        let bytes = told.trim_end().ends_with(AS_BYTES);
+        let found = match bytes && topic.space == SpaceId::ROS1 {
+            true => self.ros1.find(&name).ok(),
+            false => self.ros2.find(&name).ok(),
+        };
+        let form = found.as_ref().and_then(|message| match bytes {
+            true => Some(Form::Bytes),
+            false => plan(message, &name, described),
+        });
+        match (found, form) {
+            (Some(message), Some(form)) => Some(Ros { message, form }),
+            _ => {
+                if self.unknown.len() < MOST_UNKNOWN {
+                    self.unknown.insert(name.to_string());
+                }
+                None
+            }
+        }
+    }
+
+    /// Returns a name that no other topic uses. A part of a message does not have the name of its
+    /// ROS topic.
+    fn name(&mut self, topic: TopicId, described: Option<&Described>, is_ros: bool) -> String {
+        let id = topic.to_string();
+        let own = topic.space.get();
+        let ros = described.filter(|_| is_ros).and_then(|described| {
+            let of_space = |space| {
+                described
+                    .ros_topics
+                    .iter()
+                    .find(move |(of, _)| *of == space)
+            };
+            let found = of_space(own).or_else(|| described.ros_topics.first());
+            found.map(|(_, topic)| topic.clone())
+        });
+        let named = || {
+            let name = described.map(|described| described.name.clone());
+            name.filter(|name| !name.is_empty())
+        };
+        let wanted = ros.or_else(named).unwrap_or_else(|| format!("/{id}"));
+        let owner = *self.names.entry(wanted.clone()).or_insert(topic);
+        match owner == topic {
+            true => wanted,
+            false => format!("{wanted}@{id}"),
+        }
+    }
+}
+
+struct Ros {
+    message: Arc<MessageType>,
+    form: Form,
+}
+
+impl Channel {
+    /// Appends the message of a value to `out`.
+    ///
+    /// # Errors
+    /// [`Unfit::Mismatch`]; `out` is then unchanged.
+    pub(super) fn encode(
+        &self,
+        message: &DataSetMessage<'_>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), Unfit> {
+        let unfit = |_| Unfit::Mismatch;
+        match &self.form {
+            Form::Ros(plan) => {
+                let fields = message.fields().map_err(unfit)?;
+                decode_fields(plan, fields, out).map_err(|_| Unfit::Mismatch)
+            }
+            Form::Bytes => {
+                let mut fields = message.fields().map_err(unfit)?;
+                match (fields.next(), fields.next()) {
+                    (Some(Ok(Variant::Scalar(Scalar::ByteString(Some(bytes))))), None) => {
+                        out.extend_from_slice(bytes);
+                        Ok(())
+                    }
+                    _ => Err(Unfit::Mismatch),
+                }
+            }
+            Form::Json => {
+                let mut named =
+                    plain::message(message, self.described.as_deref()).map_err(unfit)?;
+                if message.kind == MessageKind::DeltaFrame {
+                    named.0.insert(0, (DELTA.to_owned(), json!(true)));
+                }
+                serde_json::to_writer(out, &named).map_err(|_| Unfit::Mismatch)
+            }
+        }
+    }
+}
+
+/// Returns whether a channel of the first description fits a value with the second.
+fn is_same(known: Option<&Arc<Described>>, described: Option<&Arc<Described>>) -> bool {
+    match (known, described) {
+        (_, None) => true,
+        (None, Some(_)) => false,
+        (Some(known), Some(described)) => Arc::ptr_eq(known, described) || known == described,
+    }
+}
+
+/// Returns the conversion of the announced fields to the message; `None` if they do not form it.
+fn plan(message: &Arc<MessageType>, name: &TypeName, described: &Described) -> Option<Form> {
+    let fields = described.fields().iter().map(leaf);
+    let of_writer = bridge_core::Described {
+        message_type: name.clone(),
+        bytes: false,
+        name: String::new(),
+        about: String::new(),
+        fields: fields.collect::<Option<_>>()?,
+    };
+    let selection: Selection = of_writer.selection(message)?;
+    let plan = Plan::compile(message, &selection, Wire::Cdr).ok()?;
+    Some(Form::Ros(Box::new(plan)))
+}
+
+fn leaf(field: &Field) -> Option<Leaf> {
+    let rank = match field.rank {
+        -1 => Rank::Scalar,
+        1 => Rank::Array {
+            fixed: field.dimensions.first().copied().filter(|size| *size > 0),
+        },
+        _ => return None,
+    };
+    Some(Leaf {
+        path: field.name.clone(),
+        builtin: field.builtin?,
+        rank,
+    })
+}
+
+/// Returns the JSON Schema of a value.
+fn schema(described: Option<&Described>) -> Value {
+    let mut properties = Map::new();
+    if let Some(Described {
+        what: What::Value(fields),
+        ..
+    }) = described
+    {
+        for field in fields {
+            properties.insert(field.name.clone(), schema_of(field));
+        }
+    }
+    json!({
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "type": "object",
+        "properties": properties,
+    })
+}
+
+fn schema_of(field: &Field) -> Value {
+    let one = match field.builtin.map(kind) {
+        Some(kind) if !field.is_array() => json!({"type": kind}),
+        Some(kind) => json!({"type": "array", "items": {"type": kind}}),
+        None => json!({}),
+    };
+    let meaning = field.meaning();
+    match (one, meaning.as_str()) {
+        (one, "") => one,
+        (Value::Object(mut one), meaning) => {
+            one.insert("description".to_owned(), meaning.into());
+            Value::Object(one)
+        }
+        (one, _) => one,
+    }
+}
+
+/// Returns the type of a value in JSON.
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "all others are shown as text or object"
+)]
+const fn kind(builtin: BuiltinType) -> &'static str {
+    match builtin {
+        BuiltinType::Boolean => "boolean",
+        BuiltinType::SByte
+        | BuiltinType::Byte
+        | BuiltinType::Int16
+        | BuiltinType::UInt16
+        | BuiltinType::Int32
+        | BuiltinType::UInt32
+        | BuiltinType::Int64
+        | BuiltinType::UInt64 => "integer",
+        BuiltinType::Float | BuiltinType::Double => "number",
+        BuiltinType::ExtensionObject => "object",
+        _ => "string",
+    }
+}
+
+/// Time that values wait for the description of their topic.
+pub(super) const DESCRIBED_WITHIN: Duration = Duration::from_millis(1500);
+/// The end of the description of a message as on the wire.
+const AS_BYTES: &str = " as bytes";
+/// The member of a JSON value with only some of its fields.
+const DELTA: &str = "$delta";
+const MOST_UNKNOWN: usize = 64;
+
+#[cfg(test)]
+mod tests;

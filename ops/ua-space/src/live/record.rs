@@ -1,0 +1,301 @@
+//! `ua-space record`: records the messages of a group as pcapng, or its values as MCAP.
+//!
+//! Reading order: this module (the loop), `packets` and `values` (the two forms), `mcap` (records
+//! of the container), `sink` (the file).
+
+mod mcap;
+mod packets;
+mod sink;
+mod values;
+
+use std::io::{self, IsTerminal as _, Write as _};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::time::Duration;
+
+use serde::Serialize;
+use transport::{Received, Senders};
+
+use self::packets::Packets;
+use self::sink::Sink;
+use self::values::Values;
+use super::book::News;
+use super::list::{FIRST_ASKED, json};
+use super::text::harmless;
+use super::{Go, Incoming, LOOK, Live, in_group, take, until};
+use crate::arguments::Record;
+use crate::capture::Link;
+use crate::cell::own_drops;
+use crate::exit::Failure;
+use crate::report::warn;
+
+/// Runs `ua-space record`.
+pub(crate) fn record(arguments: &Record) -> Result<(), Failure> {
+    let format = Format::of(&arguments.file)?;
+    in_group(&arguments.group, async |mut live| {
+        live.want_calls(FIRST_ASKED);
+        let mut recording = Recording::new(format, &arguments.file, &live)?;
+        let ended = recording.run(&mut live, arguments).await;
+        let now = live.now();
+        let time = live.utc(now);
+        let totals = recording.totals(now);
+        let finished = recording.finish(time);
+        ended?;
+        let size = finished?;
+        if totals.messages == 0 {
+            return Err(nothing(&live, &arguments.file));
+        }
+        totals.print(size, arguments)
+    })
+}
+
+/// Removes the empty recording and returns the failure.
+fn nothing(live: &Live, file: &Path) -> Failure {
+    // The file has no messages, so nothing is lost with it or left with it.
+    let _removed = std::fs::remove_file(file);
+    if let Some(why) = live.carrier.lost() {
+        return Failure::Unavailable(why);
+    }
+    let group = live.group();
+    Failure::Unavailable(format!(
+        "nothing was recorded from {group}\n  = help: is this the group and the interface (--address, --interface)?"
+    ))
+}
+
+/// The form of a recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Format {
+    PcapNg,
+    Mcap,
+}
+
+impl Format {
+    /// Returns the form by the ending of the file.
+    fn of(file: &Path) -> Result<Self, Failure> {
+        let ending = file.extension().and_then(|ending| ending.to_str());
+        match ending.map(str::to_ascii_lowercase).as_deref() {
+            Some("pcapng") => Ok(Self::PcapNg),
+            Some("mcap") => Ok(Self::Mcap),
+            _ => Err(Failure::Usage(format!(
+                "{}: the name ends with .pcapng (all messages) or .mcap (values)",
+                file.display()
+            ))),
+        }
+    }
+}
+
+/// A recording in progress.
+struct Recording {
+    form: Form,
+    /// Messages or values in the recording.
+    messages: u64,
+    /// Bytes of the received messages.
+    bytes: u64,
+    /// Messages dropped because the disk was too slow.
+    slow: u64,
+    /// The drops of the kernel before the recording.
+    drops_before: u64,
+}
+
+enum Form {
+    Packets(Box<Packets>),
+    Values(Box<Values>),
+}
+
+impl Recording {
+    fn new(format: Format, file: &Path, live: &Live) -> Result<Self, Failure> {
+        let sink = Sink::create(file)?;
+        let form = match format {
+            Format::PcapNg => {
+                let link = link(live);
+                Form::Packets(Box::new(Packets::new(
+                    sink,
+                    link,
+                    &live.carrier.interface(),
+                )))
+            }
+            Format::Mcap => Form::Values(Box::new(Values::new(sink))),
+        };
+        Ok(Self {
+            form,
+            messages: 0,
+            bytes: 0,
+            slow: 0,
+            drops_before: own_drops(),
+        })
+    }
+
+    /// Records until the end that the arguments name, or a signal.
+    async fn run(&mut self, live: &mut Live, arguments: &Record) -> Result<(), Failure> {
+        let end = until(live.now(), arguments.seconds);
+        let most_bytes = arguments.size.map_or(u64::MAX, |mib| mib << 20);
+        let most = arguments.count.unwrap_or(u64::MAX);
+        let (mut looked, mut flushed) = (Duration::ZERO, Duration::ZERO);
+        loop {
+            let now = live.now();
+            if now >= looked {
+                looked = now + LOOK;
+                live.probe(now);
+            }
+            if now >= flushed {
+                flushed = now + FLUSH;
+                self.flush(now)?;
+            }
+            if now >= end || self.messages >= most || self.bytes >= most_bytes {
+                return Ok(());
+            }
+            match live.receive(end.min(now + LOOK)).await? {
+                Incoming::Interrupted => return Ok(()),
+                Incoming::Nothing => {}
+                Incoming::Message(Received { length, from }) => {
+                    self.add(live, (length, from))?;
+                }
+            }
+        }
+    }
+
+    /// Adds the message in the buffer. Own probes are no part of the cell.
+    fn add(&mut self, live: &mut Live, (length, from): (usize, SocketAddr)) -> Result<(), Failure> {
+        if live.is_own(from) {
+            return Ok(());
+        }
+        let now = live.now();
+        let time = live.utc(now);
+        let datagram = live.buffer.get(..length).unwrap_or_default();
+        let read = (&mut live.book, live.sealing.as_mut());
+        self.bytes += u64::try_from(length).unwrap_or_default();
+        let (mut added, mut dropped) = (0, 0);
+        let mut fault = None;
+        match &mut self.form {
+            Form::Packets(packets) => {
+                match packets.add(time, from, datagram)? {
+                    true => added += 1,
+                    false => dropped += 1,
+                }
+                take(read, (datagram, from), now, &mut |_, _| Go::On);
+            }
+            Form::Values(values) => {
+                let mut each = |news: News<'_>, now| {
+                    let recorded = match &news {
+                        News::Sample(sample) => values.add(sample, (now, time)),
+                        News::Announced(topic, super::book::Kind::Value, described, _) => {
+                            values.described(*topic, described, now);
+                            return Go::On;
+                        }
+                        News::Announced(..) | News::Response(..) => return Go::On,
+                    };
+                    match recorded {
+                        Ok(true) => added += 1,
+                        Ok(false) => dropped += 1,
+                        Err(failure) => fault = Some(failure),
+                    }
+                    Go::On
+                };
+                take(read, (datagram, from), now, &mut each);
+            }
+        }
+        self.messages += added;
+        self.slow += dropped;
+        fault.map_or(Ok(()), Err)
+    }
+
+    /// Hands over the messages so far, and shows the progress on a terminal.
+    fn flush(&mut self, now: Duration) -> Result<(), Failure> {
+        match &mut self.form {
+            Form::Packets(packets) => packets.flush()?,
+            Form::Values(values) => {
+                values.give_up_waiting(now);
+                values.flush()?;
+            }
+        }
+        let mut err = io::stderr().lock();
+        if err.is_terminal() {
+            let (messages, seconds) = (self.messages, now.as_secs());
+            // A terminal that is closed does not end the recording.
+            let _shown = write!(err, "\r{messages} messages in {seconds} s");
+            let _flushed = err.flush();
+        }
+        Ok(())
+    }
+
+    fn totals(&self, now: Duration) -> Totals {
+        Totals {
+            messages: self.messages,
+            seconds: now.as_secs_f64(),
+            slow_disk: self.slow,
+            full_socket: own_drops().saturating_sub(self.drops_before),
+        }
+    }
+
+    /// Ends the file. Returns its length.
+    fn finish(self, time: i128) -> Result<u64, Failure> {
+        let dropped = self.slow + own_drops().saturating_sub(self.drops_before);
+        match self.form {
+            Form::Packets(packets) => packets.finish(time, (self.messages, dropped)),
+            Form::Values(values) => values.finish(),
+        }
+    }
+}
+
+/// Returns the form of the packets of a group or broker.
+fn link(live: &Live) -> Link {
+    match (live.carrier.senders(), live.group().parse()) {
+        (Senders::Addresses, Ok(SocketAddr::V4(group))) => Link::Udp(group),
+        _ => Link::Exported,
+    }
+}
+
+/// The summary of a recording.
+#[derive(Debug, Serialize)]
+struct Totals {
+    messages: u64,
+    seconds: f64,
+    /// Messages dropped because the disk was too slow.
+    slow_disk: u64,
+    /// Messages that the kernel dropped because this program was too slow.
+    full_socket: u64,
+}
+
+impl Totals {
+    fn print(&self, size: u64, arguments: &Record) -> Result<(), Failure> {
+        #[derive(Serialize)]
+        struct Shown<'a> {
+            file: String,
+            bytes: u64,
+            #[serde(flatten)]
+            totals: &'a Totals,
+        }
+        let file = harmless(&arguments.file.display().to_string());
+        let mut out = io::stdout().lock();
+        if arguments.json {
+            let shown = Shown {
+                file,
+                bytes: size,
+                totals: self,
+            };
+            writeln!(out, "{}", json(&shown)?)?;
+            return Ok(());
+        }
+        if io::stderr().is_terminal() {
+            // The line of the progress ends here.
+            writeln!(io::stderr())?;
+        }
+        let (messages, seconds) = (self.messages, self.seconds);
+        writeln!(
+            out,
+            "{file}: {messages} messages in {seconds:.1} s, {size} bytes"
+        )?;
+        for (count, why) in [
+            (self.slow_disk, "the disk was too slow"),
+            (self.full_socket, "the socket was full"),
+        ] {
+            if count > 0 {
+                warn(&format!("{count} messages dropped: {why}"));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The interval at which the messages so far are handed over to the disk.
+const FLUSH: Duration = Duration::from_secs(1);

@@ -1,0 +1,265 @@
+//! Recordings of the values as MCAP.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use mappings::TopicId;
+use uadp::{
+    DataSetMessage, FieldEncoding, MessageKind, NetworkHeader, NetworkMessage,
+    NetworkMessageEncoder, Timestamp,
+};
+
+use super::mcap::{Mcap, Message};
+use super::sink::Sink;
+use crate::exit::Failure;
+use crate::live::book::Sample;
+use crate::live::channels::{Channel, Channels, DESCRIBED_WITHIN, Unfit};
+use crate::live::described::Described;
+use crate::report::warn;
+
+/// A recording of the values by topic.
+pub(super) struct Values {
+    sink: Sink,
+    writer: Mcap,
+    channels: Channels,
+    /// Ids of the channels in the file.
+    written: BTreeSet<u16>,
+    /// Bytes that are not handed over to the disk.
+    part: Vec<u8>,
+    /// Values that wait for the description of their topic.
+    waiting: VecDeque<Waiting>,
+    /// The size of all waiting values.
+    weight: usize,
+    left_out: BTreeMap<Unfit, u64>,
+    scratch: Vec<u8>,
+}
+
+/// A value that waits for the description of its topic.
+struct Waiting {
+    topic: TopicId,
+    /// The time of arrival, since the group was joined.
+    since: Duration,
+    times: Times,
+    /// A NetworkMessage with the value alone.
+    datagram: Vec<u8>,
+}
+
+/// The times of a value, in nanoseconds since 1970.
+#[derive(Debug, Clone, Copy)]
+struct Times {
+    logged: u64,
+    published: u64,
+}
+
+impl Values {
+    pub(super) fn new(sink: Sink) -> Self {
+        let mut part = Vec::new();
+        let writer = Mcap::begin(&mut part);
+        Self {
+            sink,
+            writer,
+            channels: Channels::new(),
+            written: BTreeSet::new(),
+            part,
+            waiting: VecDeque::new(),
+            weight: 0,
+            left_out: BTreeMap::new(),
+            scratch: Vec::new(),
+        }
+    }
+
+    /// Adds a value that arrived at `now`; `time` is the same time since 1970. Returns false if the
+    /// value is dropped because the disk is too slow.
+    pub(super) fn add(
+        &mut self,
+        sample: &Sample<'_>,
+        (now, time): (Duration, i128),
+    ) -> Result<bool, Failure> {
+        // A heartbeat is a key frame without fields.
+        let message = &sample.message;
+        let is_value = message.kind != MessageKind::KeepAlive && !message.payload().is_empty();
+        if !is_value || !message.is_valid() {
+            return Ok(true);
+        }
+        if self.writer.waiting() >= CHUNK && !self.flush()? {
+            return Ok(false);
+        }
+        let times = Times::of(sample, time);
+        let described = sample.described.as_ref();
+        match self.channels.channel(sample.topic, described, now) {
+            Ok(channel) => {
+                self.release(sample.topic, &channel);
+                self.write(&channel, times, &sample.message);
+            }
+            Err(Unfit::Undescribed) => self.hold(sample, times, now),
+            Err(unfit) => self.leave_out(unfit),
+        }
+        Ok(true)
+    }
+
+    /// Records the waiting values of a topic whose description has arrived.
+    pub(super) fn described(&mut self, topic: TopicId, described: &Arc<Described>, now: Duration) {
+        if self.waiting.iter().any(|waiting| waiting.topic == topic)
+            && let Ok(channel) = self.channels.channel(topic, Some(described), now)
+        {
+            self.release(topic, &channel);
+        }
+    }
+
+    /// Records the values that have waited too long for a description, without it.
+    pub(super) fn give_up_waiting(&mut self, now: Duration) {
+        while let Some(first) = self.waiting.front()
+            && now >= first.since + DESCRIBED_WITHIN
+        {
+            let topic = first.topic;
+            match self.channels.channel(topic, None, now) {
+                Ok(channel) => self.release(topic, &channel),
+                Err(unfit) => {
+                    if let Some(dropped) = self.waiting.pop_front() {
+                        self.weight -= dropped.datagram.len();
+                    }
+                    self.leave_out(unfit);
+                }
+            }
+        }
+    }
+
+    /// Hands over the current chunk. Returns false if the disk is too slow.
+    pub(super) fn flush(&mut self) -> Result<bool, Failure> {
+        if self.part.is_empty() {
+            self.writer.end_chunk(self.sink.length(), &mut self.part);
+        }
+        self.sink.offer(&mut self.part)
+    }
+
+    /// Ends the file. Returns its length.
+    pub(super) fn finish(mut self) -> Result<u64, Failure> {
+        self.give_up_waiting(Duration::MAX);
+        for (unfit, count) in &self.left_out {
+            warn(&format!("{count} left out: {}", unfit.label()));
+        }
+        let unknown: Vec<&str> = self.channels.unknown().iter().map(String::as_str).collect();
+        if !unknown.is_empty() {
+            warn(&format!(
+                "recorded as JSON, because these definitions are not known here: {}\n  = help: set AMENT_PREFIX_PATH or ROS_PACKAGE_PATH to folders that have them",
+                unknown.join(", ")
+            ));
+        }
+        let at = self.sink.length();
+        let begin = self.part.len();
+        let at = at + u64::try_from(begin).unwrap_or_default();
+        let mut end = Vec::new();
+        self.writer.finish(at, &mut end);
+        self.part.extend(end);
+        self.sink.finish(self.part)
+    }
+
+    fn write(&mut self, channel: &Channel, times: Times, message: &DataSetMessage<'_>) {
+        self.scratch.clear();
+        let mut data = std::mem::take(&mut self.scratch);
+        match channel.encode(message, &mut data) {
+            Ok(()) => {
+                if self.written.insert(channel.id) {
+                    self.writer.channel(channel);
+                }
+                self.writer.message(&Message {
+                    channel: channel.id,
+                    sequence: message.sequence_number().unwrap_or_default().into(),
+                    logged: times.logged,
+                    published: times.published,
+                    data: &data,
+                });
+            }
+            Err(unfit) => self.leave_out(unfit),
+        }
+        self.scratch = data;
+    }
+
+    fn hold(&mut self, sample: &Sample<'_>, times: Times, now: Duration) {
+        let Some(datagram) = alone(&sample.message) else {
+            return self.leave_out(Unfit::Undescribed);
+        };
+        self.weight += datagram.len();
+        self.waiting.push_back(Waiting {
+            topic: sample.topic,
+            since: now,
+            times,
+            datagram,
+        });
+        while self.waiting.len() > MOST_WAITING || self.weight > MOST_WEIGHT {
+            let Some(oldest) = self.waiting.pop_front() else {
+                break;
+            };
+            self.weight -= oldest.datagram.len();
+            self.leave_out(Unfit::Undescribed);
+        }
+    }
+
+    fn release(&mut self, topic: TopicId, channel: &Channel) {
+        if self.waiting.is_empty() {
+            return;
+        }
+        let all = std::mem::take(&mut self.waiting);
+        let (ready, rest): (VecDeque<_>, VecDeque<_>) =
+            all.into_iter().partition(|waiting| waiting.topic == topic);
+        self.waiting = rest;
+        for waiting in ready {
+            self.weight -= waiting.datagram.len();
+            let message = NetworkMessage::decode(&waiting.datagram).ok();
+            let message = message.and_then(|message| message.messages().next()?.ok());
+            match message {
+                Some(message) => self.write(channel, waiting.times, &message),
+                None => self.leave_out(Unfit::Mismatch),
+            }
+        }
+    }
+
+    fn leave_out(&mut self, unfit: Unfit) {
+        *self.left_out.entry(unfit).or_default() += 1;
+    }
+}
+
+impl Times {
+    fn of(sample: &Sample<'_>, arrived: i128) -> Self {
+        let header = sample.message.header();
+        let network = &sample.network;
+        let taken = header.timestamp.map(|time| (time, header.picoseconds));
+        let sent = network.timestamp.map(|time| (time, network.picoseconds));
+        let nanos = |(time, picoseconds): (_, Option<u16>)| {
+            let stamp = Timestamp {
+                time,
+                picoseconds: picoseconds.unwrap_or_default(),
+            };
+            u64::try_from(stamp.unix_nanos()).ok()
+        };
+        let logged = u64::try_from(arrived).unwrap_or_default();
+        Self {
+            logged,
+            published: taken.or(sent).and_then(nanos).unwrap_or(logged),
+        }
+    }
+}
+
+/// Returns a NetworkMessage with this message alone; `None` for messages other than whole ones of
+/// Variants.
+fn alone(message: &DataSetMessage<'_>) -> Option<Vec<u8>> {
+    let is_whole = matches!(message.kind, MessageKind::KeyFrame | MessageKind::Event);
+    if !is_whole || message.encoding() != FieldEncoding::Variant {
+        return None;
+    }
+    let mut datagram = Vec::new();
+    let mut writer =
+        NetworkMessageEncoder::new(&mut datagram, &NetworkHeader::default(), None).ok()?;
+    let mut frame = writer.key_frame(&message.header()).ok()?;
+    frame.fields_block(message.payload()).ok()?;
+    frame.finish().ok()?;
+    writer.finish().ok()?;
+    Some(datagram)
+}
+
+/// Size in bytes at which a chunk is handed over.
+const CHUNK: usize = 1 << 20;
+/// Maximum number and size of values that wait for descriptions.
+const MOST_WAITING: usize = 10_000;
+const MOST_WEIGHT: usize = 16 << 20;

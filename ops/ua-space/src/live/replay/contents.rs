@@ -1,0 +1,410 @@
+//! The contents of a recording, and the messages in it that are sent again.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::Read;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use mappings::{Motion, SpaceId, TopicId};
+use uadp::discovery::{Announced, Announcement};
+use uadp::{
+    NetworkMessage, NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, SecurityHeader,
+};
+
+use super::datagram;
+use crate::arguments::Replay;
+use crate::capture::Capture;
+use crate::exit::Failure;
+use crate::input::{self, Input};
+use crate::live::book::{BAD, Book, Kind};
+use crate::live::described::{Described, topic_of};
+use crate::live::sealing::Sealing;
+use crate::packet::{self, Found, Fragments};
+
+/// Reads the NetworkMessages of a recording.
+pub(super) struct Recorded {
+    name: String,
+    capture: Capture<Box<dyn Read>>,
+    fragments: Fragments,
+    /// The time of the last message.
+    time: i128,
+}
+
+/// A recorded datagram.
+pub(super) struct Datagram {
+    /// Nanoseconds since 1970.
+    pub(super) time: i128,
+    pub(super) from: SocketAddr,
+    pub(super) bytes: Vec<u8>,
+}
+
+impl Recorded {
+    /// Opens a capture.
+    ///
+    /// # Errors
+    /// A [`Failure`] if the file cannot be read or is no capture.
+    pub(super) fn open(file: &Path) -> Result<Self, Failure> {
+        let name = file.display().to_string();
+        match input::open(&name, false)? {
+            Input::Capture(capture) => Ok(Self {
+                name,
+                capture,
+                fragments: Fragments::default(),
+                time: 0,
+            }),
+            Input::Datagram(_) | Input::Lines(_) => Err(Failure::Data(format!(
+                "{name} is no pcapng or pcap file; `ua-space record` makes one"
+            ))),
+        }
+    }
+
+    /// Returns the next UDP datagram that was captured as a whole.
+    pub(super) fn next(&mut self) -> Result<Option<Datagram>, Failure> {
+        loop {
+            let packet = self.capture.next_packet();
+            let packet = packet.map_err(|error| input::failure(&self.name, error))?;
+            let Some(packet) = packet else {
+                return Ok(None);
+            };
+            self.time = packet.time.unwrap_or(self.time);
+            let found = packet::udp(packet.link_type, &packet.data, &mut self.fragments);
+            if let Found::Udp(udp) = found
+                && udp.missing == 0
+            {
+                return Ok(Some(Datagram {
+                    time: self.time,
+                    from: udp.source,
+                    bytes: udp.payload.into_owned(),
+                }));
+            }
+        }
+    }
+}
+
+/// The reason why a message is not sent again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum LeftOut {
+    /// A value of the OPC UA side, or a value that acts where it arrives.
+    Command,
+    /// A value that may be a command, because the recording has no description of it.
+    Undescribed,
+    /// A request, a response or the description of a call.
+    Call,
+    /// The description of a program, which does not run.
+    Program,
+    /// A question of a tool or program.
+    Probe,
+    /// A description that is sent before the values.
+    SentBefore,
+    /// A secured message without its keys.
+    Secured,
+    /// A message of a space that is not wanted.
+    OtherSpace,
+    /// No message of the space.
+    Foreign,
+    Malformed,
+}
+
+impl LeftOut {
+    /// Returns the text for output.
+    pub(super) const fn label(self) -> &'static str {
+        match self {
+            Self::Command => "commands, which --commands sends",
+            Self::Undescribed => {
+                "values without a description, which may be commands; --commands sends them"
+            }
+            Self::Call => "requests, responses and descriptions of calls, which --commands sends",
+            Self::Program => "descriptions of programs",
+            Self::Probe => "probes",
+            Self::SentBefore => "large descriptions, which are sent before the values",
+            Self::Secured => "secured messages, which need --keys",
+            Self::OtherSpace => "messages of other spaces than --space",
+            Self::Foreign => "datagrams that are not of the space",
+            Self::Malformed => "malformed messages",
+        }
+    }
+}
+
+/// A message to send, without security.
+#[derive(Debug)]
+pub(super) struct Prepared {
+    pub(super) plain: Vec<u8>,
+    /// Whether it was secured in the recording.
+    pub(super) secured: bool,
+    /// Values that were removed from it, by reason.
+    pub(super) removed: BTreeMap<LeftOut, u64>,
+}
+
+/// The topics of a recording.
+pub(super) struct Contents {
+    commands: bool,
+    only: BTreeSet<SpaceId>,
+    /// The time of the first message of the space.
+    pub(super) first: i128,
+    book: Book,
+    descriptions: BTreeMap<TopicId, Vec<Arc<Described>>>,
+    /// The newest announcement of each topic.
+    announcements: BTreeMap<TopicId, Vec<u8>>,
+    /// The size of all announcements.
+    weight: usize,
+}
+
+impl Contents {
+    /// Reads the descriptions and topics of a recording.
+    ///
+    /// # Errors
+    /// A [`Failure`] if the file cannot be read.
+    pub(super) fn read(arguments: &Replay, sealing: &mut Option<Sealing>) -> Result<Self, Failure> {
+        let mut recorded = Recorded::open(&arguments.file)?;
+        let mut contents = Self {
+            commands: arguments.commands,
+            only: arguments.space.iter().copied().collect(),
+            first: i128::MAX,
+            book: Book::new(),
+            descriptions: BTreeMap::new(),
+            announcements: BTreeMap::new(),
+            weight: 0,
+        };
+        let mut reassembler = Reassembler::new(ReassemblyLimits::default());
+        let mut scratch = Vec::new();
+        while let Some(datagram) = recorded.next()? {
+            let Ok(message) = NetworkMessage::decode(&datagram.bytes) else {
+                continue;
+            };
+            if space(&message).is_none() {
+                continue;
+            }
+            contents.first = contents.first.min(datagram.time);
+            let since = u64::try_from(datagram.time - contents.first).unwrap_or_default();
+            let now = Duration::from_nanos(since);
+            scratch.clear();
+            let message = match sealing {
+                Some(sealing) => sealing.open(message, &mut scratch),
+                None => message,
+            };
+            let from = datagram.from;
+            contents.book.handle((&message, from), now, &mut |_| {});
+            contents.announcement(&message, (&mut reassembler, from), now);
+        }
+        for (topic, kind, described, _) in contents.book.all_announced() {
+            if kind == Kind::Value {
+                let all = contents.descriptions.entry(topic).or_default();
+                all.push(Arc::clone(described));
+            }
+        }
+        Ok(contents)
+    }
+
+    /// Keeps the announcement of a topic.
+    fn announcement(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        (reassembler, from): (&mut Reassembler<SocketAddr>, SocketAddr),
+        now: Duration,
+    ) {
+        if message.message_type() != NetworkMessageType::Announcement || message.is_sealed() {
+            return;
+        }
+        let announcement = match message.is_chunk() {
+            false => Announcement::decode(message).ok(),
+            true => {
+                let whole = reassembler.receive_from(from, message, now).ok().flatten();
+                whole.and_then(|whole| Announcement::decode_body(whole.bytes).ok())
+            }
+        };
+        let Some(announcement) = announcement else {
+            return;
+        };
+        let (Some(topic), Some(publisher)) =
+            (described_topic(&announcement), message.publisher_id())
+        else {
+            return;
+        };
+        let mut datagram = Vec::new();
+        let encoded = announcement.encode(publisher, SecurityHeader::NONE, &mut datagram);
+        if encoded.is_ok() && self.weight + datagram.len() <= MOST_WEIGHT {
+            self.weight += datagram.len();
+            let before = self.announcements.insert(topic, datagram);
+            self.weight -= before.map_or(0, |before| before.len());
+        }
+    }
+
+    /// Returns the topics with the number of their values, and the reason why they are left out.
+    pub(super) fn topics(&self) -> impl Iterator<Item = (TopicId, u64, Option<LeftOut>)> {
+        let topics = self.book.topics();
+        topics.map(|(topic, heard)| (topic, heard.values, self.left_out(topic)))
+    }
+
+    /// Returns the description of a topic.
+    pub(super) fn described(&self, topic: TopicId) -> Option<&Arc<Described>> {
+        self.descriptions.get(&topic)?.first()
+    }
+
+    /// Returns the spaces with messages to send.
+    pub(super) fn spaces(&self) -> BTreeSet<u16> {
+        let sent = self.topics().filter(|(.., left_out)| left_out.is_none());
+        let mut spaces: BTreeSet<u16> = sent.map(|(topic, ..)| topic.space.into()).collect();
+        if self.commands {
+            let wanted = |space: &u16| SpaceId::new(*space).is_some_and(|of| self.is_wanted(of));
+            spaces.extend(self.book.spaces().into_iter().filter(wanted));
+        }
+        spaces
+    }
+
+    /// Returns the announcements of the topics that are sent.
+    pub(super) fn announcements(&self) -> impl Iterator<Item = (TopicId, &[u8])> {
+        let all = self.announcements.iter();
+        let sent = all.filter(|(topic, _)| self.left_out(**topic).is_none());
+        sent.map(|(topic, datagram)| (*topic, datagram.as_slice()))
+    }
+
+    fn is_wanted(&self, space: SpaceId) -> bool {
+        self.only.is_empty() || self.only.contains(&space)
+    }
+
+    /// Returns the reason why the values of a topic are left out.
+    fn left_out(&self, topic: TopicId) -> Option<LeftOut> {
+        if !self.is_wanted(topic.space) {
+            return Some(LeftOut::OtherSpace);
+        }
+        if self.commands {
+            return None;
+        }
+        if topic.space == SpaceId::UA {
+            return Some(LeftOut::Command);
+        }
+        match self.descriptions.get(&topic) {
+            None => Some(LeftOut::Undescribed),
+            Some(all) => all.iter().any(|one| acts(one)).then_some(LeftOut::Command),
+        }
+    }
+
+    /// Returns the message to send for a recorded datagram, or the reason why it is left out.
+    pub(super) fn prepare(
+        &self,
+        datagram: &[u8],
+        sealing: &mut Option<Sealing>,
+    ) -> Result<Prepared, LeftOut> {
+        let message = NetworkMessage::decode(datagram).map_err(|_| LeftOut::Malformed)?;
+        if message.message_type() == NetworkMessageType::Probe {
+            return Err(LeftOut::Probe);
+        }
+        let space = space(&message).ok_or(LeftOut::Foreign)?;
+        if !self.is_wanted(space) {
+            return Err(LeftOut::OtherSpace);
+        }
+        let secured = message.is_sealed();
+        let mut scratch = Vec::new();
+        let message = match sealing {
+            Some(sealing) => sealing.open(message, &mut scratch),
+            None => message,
+        };
+        if message.is_sealed() {
+            return Err(LeftOut::Secured);
+        }
+        let mut removed = BTreeMap::new();
+        let plain = datagram::plain(&message);
+        let plain = match self.place(&message, space)? {
+            Place::Whole => plain,
+            Place::Values(namespace) => {
+                let keeps = |id| {
+                    let topic = TopicId::new(space.into(), namespace, id);
+                    let why = topic.map_or(Some(LeftOut::Foreign), |topic| self.left_out(topic));
+                    if let Some(why) = why {
+                        *removed.entry(why).or_default() += 1;
+                    }
+                    why.is_none()
+                };
+                let kept = datagram::filtered(plain, keeps);
+                kept.map_err(|_| LeftOut::Malformed)?.unwrap_or_default()
+            }
+        };
+        Ok(Prepared {
+            plain,
+            secured,
+            removed,
+        })
+    }
+
+    /// Returns the way in which a message is sent.
+    fn place(&self, message: &NetworkMessage<'_>, space: SpaceId) -> Result<Place, LeftOut> {
+        if message.message_type() == NetworkMessageType::Announcement {
+            return self.place_announcement(message, space);
+        }
+        // Large requests and responses are chunks without a DataSetWriterId.
+        let is_call = message.is_action() || message.is_chunk() && message.writer_ids().is_none();
+        match (is_call, self.commands) {
+            (true, true) => return Ok(Place::Whole),
+            (true, false) => return Err(LeftOut::Call),
+            (false, _) => {}
+        }
+        let group = message.group().and_then(|group| group.writer_group_id);
+        group.map(Place::Values).ok_or(LeftOut::Foreign)
+    }
+
+    fn place_announcement(
+        &self,
+        message: &NetworkMessage<'_>,
+        space: SpaceId,
+    ) -> Result<Place, LeftOut> {
+        if message.is_chunk() {
+            return Err(LeftOut::SentBefore);
+        }
+        let announcement = Announcement::decode(message).map_err(|_| LeftOut::Malformed)?;
+        if let Announced::ActionMetaData(_) = announcement.announced {
+            return match self.commands {
+                true => Ok(Place::Whole),
+                false => Err(LeftOut::Call),
+            };
+        }
+        let topic = described_topic(&announcement).filter(|topic| topic.space == space);
+        match topic.map(|topic| self.left_out(topic)) {
+            None => Err(LeftOut::Program),
+            Some(None) => Ok(Place::Whole),
+            Some(Some(why)) => Err(why),
+        }
+    }
+}
+
+/// The way in which a message is sent.
+enum Place {
+    Whole,
+    /// Only values that are not left out, of this WriterGroup.
+    Values(u16),
+}
+
+/// Returns whether a value acts where it arrives.
+fn acts(described: &Described) -> bool {
+    let moves = |name: &str| name.parse().is_ok_and(|name| Motion::of(&name).is_some());
+    described.command || described.ros_type().is_some_and(moves)
+}
+
+/// Returns the topic that an announcement describes; `None` also for the end of a topic.
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "all else is not about a topic"
+)]
+fn described_topic(announcement: &Announcement<'_>) -> Option<TopicId> {
+    match &announcement.announced {
+        Announced::DataSetMetaData {
+            meta_data, status, ..
+        } if status.0 & BAD == 0 => topic_of(meta_data.name),
+        _ => None,
+    }
+}
+
+/// Returns the space of a message.
+pub(super) fn space(message: &NetworkMessage<'_>) -> Option<SpaceId> {
+    match message.publisher_id()? {
+        PublisherId::UInt16(space) => SpaceId::new(space),
+        PublisherId::Byte(_)
+        | PublisherId::UInt32(_)
+        | PublisherId::UInt64(_)
+        | PublisherId::String(_) => None,
+    }
+}
+
+/// Maximum size of all announcements.
+const MOST_WEIGHT: usize = 32 << 20;

@@ -1,0 +1,114 @@
+//! `ua-space live`: serves the values of a group to viewers of robot data, by the Foxglove
+//! WebSocket protocol. Viewers only read.
+//!
+//! Reading order: this module (values from the group), `hub` (channels and clients), `client` (one
+//! connection).
+
+mod client;
+mod hub;
+
+use std::io::{self, Write as _};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+
+use self::hub::{Hub, Publication};
+use super::book::{Kind, News};
+use super::channels::{Channels, Unfit};
+use super::{Go, in_group, until};
+use crate::arguments::Viewers;
+use crate::exit::Failure;
+use crate::report::warn;
+use uadp::MessageKind;
+
+/// Runs `ua-space live`.
+pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
+    in_group(&arguments.group, async |mut live| {
+        let address = SocketAddr::new(arguments.host, arguments.port);
+        let listener = TcpListener::bind(address).await.map_err(|error| {
+            Failure::Unavailable(format!(
+                "cannot listen at {address}: {error}\n  = help: is another viewer server running? --port names another port"
+            ))
+        })?;
+        let address = listener.local_addr().unwrap_or(address);
+        if !arguments.host.is_loopback() {
+            warn(&format!(
+                "every host that reaches {address} sees all values, without sign-in"
+            ));
+        }
+        let hub = Arc::new(Hub::new(live.group()));
+        let accepting = tokio::spawn(client::accept(
+            listener,
+            Arc::clone(&hub),
+            arguments.origin.clone().into(),
+        ));
+        writeln!(io::stdout(), "{} at ws://{address}", live.group())?;
+        let mut channels = Channels::new();
+        let start = live.start_utc();
+        let end = until(live.now(), arguments.seconds);
+        let mut each = |news: News<'_>, now: Duration| {
+            take(&news, (&mut channels, &hub), (start, now));
+            Go::On
+        };
+        let ended = live.listen(end, &mut each).await;
+        accepting.abort();
+        hub.close();
+        // Viewers are told that the connection ends; a viewer that does not read is left.
+        for _ in 0..MOST_WAITS {
+            if hub.is_empty() {
+                break;
+            }
+            tokio::time::sleep(WAIT).await;
+        }
+        live.tell_dropped();
+        ended.map(|_| ())
+    })
+}
+
+/// Handles a value or description of the group.
+fn take(news: &News<'_>, (channels, hub): (&mut Channels, &Hub), (start, now): (i128, Duration)) {
+    let channel = match news {
+        News::Sample(sample) => channels.channel(sample.topic, sample.described.as_ref(), now),
+        News::Announced(topic, Kind::Value, described, _) => {
+            channels.channel(*topic, Some(*described), now)
+        }
+        News::Announced(..) | News::Response(..) => return,
+    };
+    let channel = match channel {
+        Ok(channel) => channel,
+        Err(Unfit::Undescribed) => return,
+        Err(unfit) => return hub.leave_out(unfit),
+    };
+    let topic = match news {
+        News::Sample(sample) => sample.topic,
+        News::Announced(topic, ..) => *topic,
+        News::Response(..) => return,
+    };
+    hub.offer(topic, &channel);
+    let News::Sample(sample) = news else {
+        return;
+    };
+    let message = &sample.message;
+    let is_value = message.kind != MessageKind::KeepAlive && !message.payload().is_empty();
+    if !is_value || !message.is_valid() || !hub.is_wanted(channel.id) {
+        return;
+    }
+    let mut data = Vec::new();
+    match channel.encode(message, &mut data) {
+        Ok(()) => {
+            let elapsed = i128::try_from(now.as_nanos()).unwrap_or_default();
+            hub.publish(&Publication {
+                channel: channel.id,
+                time: u64::try_from(start + elapsed).unwrap_or_default(),
+                data: &data,
+            });
+        }
+        Err(unfit) => hub.leave_out(unfit),
+    }
+}
+
+/// Time to wait for the ends of the connections.
+const WAIT: Duration = Duration::from_millis(20);
+const MOST_WAITS: u32 = 25;

@@ -1,0 +1,333 @@
+//! The channels that are offered to viewers, and the queues of the viewers.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use mappings::TopicId;
+use serde_json::{Value, json};
+use tokio::sync::Notify;
+
+use crate::live::channels::{Channel, Unfit};
+use crate::report::warn;
+
+/// Connects the values of a group with the viewers.
+#[derive(Debug)]
+pub(super) struct Hub {
+    /// The name of the server for users.
+    name: String,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// The current channel of each topic, as it is advertised.
+    offered: BTreeMap<TopicId, (u16, Value)>,
+    clients: BTreeMap<u64, Arc<Client>>,
+    last_client: u64,
+    /// The reasons that were reported.
+    told: Vec<Unfit>,
+}
+
+/// A value in its channel.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Publication<'a> {
+    pub(super) channel: u16,
+    /// The time of arrival, in nanoseconds since 1970.
+    pub(super) time: u64,
+    pub(super) data: &'a [u8],
+}
+
+/// A connected viewer.
+#[derive(Debug, Default)]
+pub(super) struct Client {
+    queue: Mutex<Queue>,
+    /// Wakes the sender of the connection.
+    pub(super) wake: Notify,
+}
+
+/// The messages that wait for a viewer.
+#[derive(Debug, Default)]
+struct Queue {
+    /// Messages of the protocol.
+    control: VecDeque<String>,
+    /// The size of all messages of the protocol.
+    control_weight: usize,
+    /// Values, oldest first.
+    values: VecDeque<Vec<u8>>,
+    /// The size of all waiting values.
+    weight: usize,
+    /// Values that were dropped since the last report to the viewer.
+    dropped: u64,
+    /// The channels of the subscriptions, by the number that the viewer chose.
+    subscriptions: BTreeMap<u32, u16>,
+    closed: bool,
+}
+
+/// A message to send to a viewer.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Next {
+    Text(String),
+    Value(Vec<u8>),
+    /// Nothing waits.
+    Nothing,
+    /// The connection ends.
+    Closed,
+}
+
+impl Hub {
+    /// Creates the hub of a group.
+    pub(super) fn new(group: &str) -> Self {
+        Self {
+            name: format!("ua-space live of {group}"),
+            state: Mutex::default(),
+        }
+    }
+
+    /// Adds a viewer; `None` if there are too many.
+    pub(super) fn connect(&self) -> Option<(u64, Arc<Client>)> {
+        let mut state = self.state();
+        if state.clients.len() >= MOST_CLIENTS {
+            return None;
+        }
+        state.last_client += 1;
+        let id = state.last_client;
+        let client = Arc::new(Client::default());
+        let info = json!({
+            "op": "serverInfo",
+            "name": self.name,
+            "capabilities": [],
+            "supportedEncodings": [],
+            "metadata": {},
+            "sessionId": format!("{}-{id}", std::process::id()),
+        });
+        client.tell(&info);
+        let channels: Vec<&Value> = state.offered.values().map(|(_, shown)| shown).collect();
+        if !channels.is_empty() {
+            client.tell(&json!({"op": "advertise", "channels": channels}));
+        }
+        state.clients.insert(id, Arc::clone(&client));
+        Some((id, client))
+    }
+
+    /// Removes a viewer.
+    pub(super) fn disconnect(&self, id: u64) {
+        self.state().clients.remove(&id);
+    }
+
+    /// Ends all connections.
+    pub(super) fn close(&self) {
+        for client in self.state().clients.values() {
+            client.queue().closed = true;
+            client.wake.notify_one();
+        }
+    }
+
+    /// Returns whether no viewer is connected.
+    pub(super) fn is_empty(&self) -> bool {
+        self.state().clients.is_empty()
+    }
+
+    /// Offers the channel of a topic. It replaces another channel of the topic.
+    pub(super) fn offer(&self, topic: TopicId, channel: &Channel) {
+        let mut state = self.state();
+        let before = state.offered.get(&topic).map(|(id, _)| *id);
+        if before == Some(channel.id) {
+            return;
+        }
+        let shown = json!({
+            "id": channel.id,
+            "topic": channel.name,
+            "encoding": channel.encoding,
+            "schemaName": channel.schema_name,
+            "schema": channel.schema,
+            "schemaEncoding": channel.schema_encoding,
+        });
+        for client in state.clients.values() {
+            if let Some(before) = before {
+                client.tell(&json!({"op": "unadvertise", "channelIds": [before]}));
+                client.queue().subscriptions.retain(|_, of| *of != before);
+            }
+            client.tell(&json!({"op": "advertise", "channels": [shown]}));
+        }
+        state.offered.insert(topic, (channel.id, shown));
+    }
+
+    /// Returns whether a viewer subscribes to a channel.
+    pub(super) fn is_wanted(&self, channel: u16) -> bool {
+        let state = self.state();
+        let mut clients = state.clients.values();
+        clients.any(|client| {
+            let queue = client.queue();
+            queue.subscriptions.values().any(|of| *of == channel)
+        })
+    }
+
+    /// Queues a value for all its subscribers.
+    pub(super) fn publish(&self, publication: &Publication<'_>) {
+        for client in self.state().clients.values() {
+            client.push(publication);
+        }
+    }
+
+    /// Reports values that are not offered, once for each reason.
+    pub(super) fn leave_out(&self, unfit: Unfit) {
+        let mut state = self.state();
+        if !state.told.contains(&unfit) {
+            state.told.push(unfit);
+            warn(&format!("left out: {}", unfit.label()));
+        }
+    }
+
+    /// Handles a message of a viewer.
+    pub(super) fn handle(&self, client: &Client, text: &str) {
+        let Ok(message) = serde_json::from_str::<Value>(text) else {
+            return client.refuse("this is no JSON object");
+        };
+        let numbers = |list: &str, key: Option<&str>| -> Vec<Value> {
+            let all = message.get(list).and_then(Value::as_array);
+            let all = all.into_iter().flatten().take(MOST_SUBSCRIPTIONS);
+            all.filter_map(|one| match key {
+                Some(key) => one.get(key).cloned(),
+                None => Some(one.clone()),
+            })
+            .collect()
+        };
+        match message.get("op").and_then(Value::as_str) {
+            Some("subscribe") => {
+                let ids = numbers("subscriptions", Some("id"));
+                let channels = numbers("subscriptions", Some("channelId"));
+                for (id, channel) in ids.iter().zip(&channels) {
+                    self.subscribe(client, id, channel);
+                }
+            }
+            Some("unsubscribe") => {
+                let mut queue = client.queue();
+                for id in numbers("subscriptionIds", None) {
+                    let id = id.as_u64().and_then(|id| u32::try_from(id).ok());
+                    if let Some(id) = id {
+                        queue.subscriptions.remove(&id);
+                    }
+                }
+            }
+            Some(_) | None => client.refuse("this server is read-only: subscribe or unsubscribe"),
+        }
+    }
+
+    fn subscribe(&self, client: &Client, id: &Value, channel: &Value) {
+        let id = id.as_u64().and_then(|id| u32::try_from(id).ok());
+        let channel = channel.as_u64().and_then(|of| u16::try_from(of).ok());
+        let (Some(id), Some(channel)) = (id, channel) else {
+            return client.refuse("a subscription has a number as id and as channelId");
+        };
+        let is_offered = {
+            let state = self.state();
+            let mut offered = state.offered.values();
+            offered.any(|(of, _)| *of == channel)
+        };
+        let full = client.queue().subscriptions.len() >= MOST_SUBSCRIPTIONS;
+        match (is_offered, full) {
+            (true, false) => {
+                client.queue().subscriptions.insert(id, channel);
+            }
+            (false, _) => client.refuse(&format!("channel {channel} is not offered")),
+            (true, true) => client.refuse("too many subscriptions"),
+        }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Client {
+    /// Returns the next message for the viewer.
+    pub(super) fn next(&self) -> Next {
+        let mut queue = self.queue();
+        if queue.closed {
+            return Next::Closed;
+        }
+        if let Some(text) = queue.control.pop_front() {
+            queue.control_weight -= text.len();
+            return Next::Text(text);
+        }
+        if queue.dropped > 0 {
+            let dropped = std::mem::take(&mut queue.dropped);
+            let message = format!("{dropped} values dropped: this viewer reads too slowly");
+            return Next::Text(status(1, &message));
+        }
+        match queue.values.pop_front() {
+            Some(value) => {
+                queue.weight -= value.len();
+                Next::Value(value)
+            }
+            None => Next::Nothing,
+        }
+    }
+
+    /// Queues a value for each subscription of its channel. The oldest values give way.
+    fn push(&self, publication: &Publication<'_>) {
+        let mut queue = self.queue();
+        let subscriptions = queue.subscriptions.iter();
+        let of = subscriptions.filter(|(_, channel)| **channel == publication.channel);
+        let ids: Vec<u32> = of.map(|(id, _)| *id).collect();
+        for id in &ids {
+            let mut frame = Vec::with_capacity(publication.data.len() + 13);
+            frame.push(MESSAGE_DATA);
+            frame.extend(id.to_le_bytes());
+            frame.extend(publication.time.to_le_bytes());
+            frame.extend(publication.data);
+            queue.weight += frame.len();
+            queue.values.push_back(frame);
+        }
+        while queue.weight > MOST_WEIGHT || queue.values.len() > MOST_VALUES {
+            let Some(oldest) = queue.values.pop_front() else {
+                break;
+            };
+            queue.weight -= oldest.len();
+            queue.dropped += 1;
+        }
+        if !ids.is_empty() {
+            self.wake.notify_one();
+        }
+    }
+
+    fn tell(&self, message: &Value) {
+        self.queue_text(message.to_string());
+    }
+
+    fn refuse(&self, why: &str) {
+        self.queue_text(status(2, why));
+    }
+
+    /// Queues a message of the protocol. A viewer that does not read them is disconnected.
+    fn queue_text(&self, text: String) {
+        let mut queue = self.queue();
+        queue.control_weight += text.len();
+        queue.control.push_back(text);
+        queue.closed |= queue.control_weight > MOST_CONTROL;
+        self.wake.notify_one();
+    }
+
+    fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Returns a message for the user of a viewer; level 1 is a warning, 2 an error.
+fn status(level: u8, message: &str) -> String {
+    json!({"op": "status", "level": level, "message": message}).to_string()
+}
+
+/// The opcode of a binary message with a value.
+const MESSAGE_DATA: u8 = 1;
+const MOST_CLIENTS: usize = 32;
+/// Maximum size and number of values that wait for a viewer. A value that is larger than the size
+/// alone is dropped.
+const MOST_WEIGHT: usize = 8 << 20;
+const MOST_VALUES: usize = 4096;
+/// Maximum size of the messages of the protocol that wait for a viewer.
+const MOST_CONTROL: usize = 64 << 20;
+const MOST_SUBSCRIPTIONS: usize = 20_000;
+
+#[cfg(test)]
+mod tests;

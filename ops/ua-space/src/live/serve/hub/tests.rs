@@ -1,0 +1,94 @@
+use super::*;
+
+fn published(hub: &Hub, byte: u8, size: usize) {
+    hub.publish(&Publication {
+        channel: 7,
+        time: u64::from(byte),
+        data: &vec![byte; size],
+    });
+}
+
+/// Returns a hub that offers channel 7.
+fn hub() -> Hub {
+    let hub = Hub::new("239.192.0.40:4840");
+    let topic = "ua_1_2_10".parse().unwrap();
+    hub.state().offered.insert(topic, (7, json!({"id": 7})));
+    hub
+}
+
+fn text(client: &Client) -> Value {
+    let Next::Text(text) = client.next() else {
+        panic!("no message of the protocol");
+    };
+    serde_json::from_str(&text).unwrap()
+}
+
+#[test]
+fn a_viewer_gets_the_values_of_its_subscriptions() {
+    let hub = hub();
+    let (_, client) = hub.connect().unwrap();
+    assert_eq!(text(&client)["op"], "serverInfo");
+    assert_eq!(text(&client)["channels"][0]["id"], 7);
+    published(&hub, 1, 3);
+    assert_eq!(client.next(), Next::Nothing, "not subscribed");
+    let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":5,"channelId":7}]}"#;
+    hub.handle(&client, subscribe);
+    assert!(hub.is_wanted(7) && !hub.is_wanted(8));
+    published(&hub, 2, 3);
+    let wanted = [&[1, 5, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0][..], &[2; 3]].concat();
+    assert_eq!(client.next(), Next::Value(wanted));
+    hub.handle(&client, r#"{"op":"unsubscribe","subscriptionIds":[5]}"#);
+    assert!(!hub.is_wanted(7));
+}
+
+#[test]
+fn a_viewer_that_does_not_read_loses_its_oldest_values() {
+    let hub = hub();
+    let (_, client) = hub.connect().unwrap();
+    let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":5,"channelId":7}]}"#;
+    hub.handle(&client, subscribe);
+    for byte in 0..100 {
+        published(&hub, byte, 1 << 20);
+    }
+    assert!(client.queue().weight <= MOST_WEIGHT);
+    while text(&client)["op"] != "status" {}
+    let Next::Value(oldest) = client.next() else {
+        panic!("no value");
+    };
+    assert!(oldest.last() > Some(&90), "the newest values are kept");
+    let mut last = oldest;
+    while let Next::Value(value) = client.next() {
+        last = value;
+    }
+    assert_eq!(last.last(), Some(&99));
+    assert_eq!(client.queue().weight, 0);
+}
+
+#[test]
+fn a_viewer_cannot_publish_and_the_number_of_viewers_is_limited() {
+    let hub = hub();
+    let (id, client) = hub.connect().unwrap();
+    hub.handle(&client, r#"{"op":"advertise","channels":[]}"#);
+    hub.handle(
+        &client,
+        r#"{"op":"subscribe","subscriptions":[{"id":1,"channelId":9}]}"#,
+    );
+    let all = [text(&client), text(&client), text(&client), text(&client)];
+    let [.., published, subscribed] = &all;
+    assert_eq!(
+        (&published["op"], &published["level"]),
+        (&json!("status"), &json!(2))
+    );
+    assert!(
+        subscribed["message"]
+            .as_str()
+            .unwrap()
+            .contains("not offered")
+    );
+    for _ in 1..MOST_CLIENTS {
+        hub.connect().unwrap();
+    }
+    assert!(hub.connect().is_none());
+    hub.disconnect(id);
+    assert!(hub.connect().is_some());
+}
