@@ -1,6 +1,6 @@
 //! `ua-space replay`: sends a recording into a group again.
 //!
-//! Reading order: this module (the loop), `contents` (what is sent and what is left out),
+//! Reading order: this module (the loop), `contents` (sent and omitted messages),
 //! `datagram` and `clock` (times).
 
 mod clock;
