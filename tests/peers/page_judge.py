@@ -1,5 +1,5 @@
 """Drives the page of the cell in Chromium: every view of a running demo, in both colours and at the
-width of a phone, by the rules of axe-core, and the commands of a signed-in operator. Any console
+width of a phone, by the rules of axe-core, and the commands and alarms of a signed-in operator. Any console
 message fails."""
 
 import argparse
@@ -99,7 +99,7 @@ def views(judge, url, topic):
     for scheme in ["light", "dark"]:
         for size in [WIDE, PHONE]:
             judge.look(scheme, size)
-            for view in ["programs", "values", f"topic/{topic}", "map", "skills", "processes"]:
+            for view in ["programs", "values", f"topic/{topic}", "map", "skills", "processes", "alarms"]:
                 judge.open(url, view)
                 judge.wait(f"{view} is live", lambda: judge.text("#link") == "live")
                 judge.wait(f"{view} has a title", lambda: judge.text("h1"))
@@ -219,6 +219,65 @@ def operate(judge, binaries, folder, examples):
         log.close()
 
 
+def alarms(judge, binaries, folder):
+    """Acknowledges and confirms an alarm by the dialogs, in both colours and widths."""
+    pki = folder / "alarms-pki"
+    for name, role in [("anna", "operator"), ("otto", "observer")]:
+        add_user(binaries, pki, name, role)
+    mapping = folder / "alarms.yaml"
+    mapping.write_text("""
+namespaces: {2: urn:page-judge}
+variables:
+  - {node: ns=2;i=30, name: Line.Temperature, type: Double, origin: 0, alarm: {high: 70, high_high: 90, confirm: true}}
+  - {node: ns=2;i=31, name: Line.Guard, type: Boolean, origin: 0, alarm: {normal: true, severity: 900}}
+  - {node: ns=2;i=32, name: Line.Mode, type: Int32, origin: 0, enum: {0: idle, 3: fault}, alarm: {when: [fault]}}
+""")
+    address = "127.0.0.1:9152"
+    command = [binaries / "ua-server", mapping, "--pki", pki, "--interface", "lo", "--metrics", address, "--endpoint", "opc.tcp://127.0.0.1:48402"]
+    log = (folder / "alarms.log").open("w")
+    server = subprocess.Popen(command, stdout=log, stderr=log)
+    try:
+        url = f"http://{address}/"
+        judge.wait("the page is served", lambda: served(judge, url))
+        judge.look("light", WIDE)
+        judge.open(url, "alarms")
+        judge.wait("the conditions are listed", lambda: "Temperature" in judge.text())
+        sign(judge, "anna")
+        judge.open(url, "topic/ua_0_2_30")
+        box = judge.wait("the value can be written", lambda: judge.driver.find_elements(By.CSS_SELECTOR, "main form input"))[0]
+        box.send_keys("95", Keys.ENTER)
+        judge.wait("the value is written", lambda: "95" in judge.text("main .fields") or "95" in judge.text())
+        judge.open(url, "alarms")
+        first = lambda: judge.text(".alarm")
+        judge.wait("the alarm is first", lambda: "HighHigh" in first() and "unacknowledged" in first())
+        for scheme in ["light", "dark"]:
+            for size in [WIDE, PHONE]:
+                judge.look(scheme, size)
+                name = f"alarm-{scheme}-{'phone' if size == PHONE else 'wide'}"
+                judge.shoot(name)
+                judge.overflow(name)
+                judge.accessible(name)
+        judge.look("light", WIDE)
+        for action, after in [("Acknowledge", "unconfirmed"), ("Confirm", "anna: seen")]:
+            button = f"[aria-label='{action} Line.Temperature']"
+            judge.wait(f"{action} is offered", lambda: judge.driver.find_elements(By.CSS_SELECTOR, button))[0].click()
+            judge.driver.find_element(By.NAME, "comment").send_keys("seen")
+            judge.shoot(f"{action.lower()}-light-wide")
+            judge.accessible(action)
+            judge.driver.find_element(By.CSS_SELECTOR, "dialog[open] [type=submit]").click()
+            judge.wait(f"{action} is done", lambda: after in first() and not judge.driver.find_elements(By.CSS_SELECTOR, button))
+        judge.driver.find_element(By.ID, "sign").click()
+        sign(judge, "otto")
+        if judge.driver.find_elements(By.CSS_SELECTOR, ".alarm .button"):
+            judge.faults.append("an observer has buttons of alarms")
+        judge.console()
+        judge.driver.get("about:blank")
+    finally:
+        server.send_signal(signal.SIGTERM)
+        server.wait(20)
+        log.close()
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--binaries", type=pathlib.Path, required=True)
@@ -247,6 +306,7 @@ def main():
     judge.out = arguments.out
     with tempfile.TemporaryDirectory() as folder:
         operate(judge, arguments.binaries, pathlib.Path(folder), arguments.examples)
+        alarms(judge, arguments.binaries, pathlib.Path(folder))
     judge.driver.quit()
     print(json.dumps({"screenshots": str(arguments.out), "faults": judge.faults}, indent=2))
     sys.exit(bool(judge.faults))

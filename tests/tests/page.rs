@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 use system_tests::{
-    Browser, Cell, Child, METRICS_SERVER, Started, UadpSocket, eventually, http_get, program,
-    resident,
+    Browser, Cell, Child, METRICS_SERVER, Peer, SERVER_ENDPOINT, Started, UadpSocket, eventually,
+    http_get, program, resident,
 };
 use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
 
@@ -203,6 +203,97 @@ variables:
     shown.until("the value is shown", |view| {
         (view["row"]["value"] == "4.5").then_some(())
     });
+}
+
+#[test]
+fn an_operator_acknowledges_and_confirms_an_alarm() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    add_user(&cell, "anna", "operator");
+    add_user(&cell, "otto", "observer");
+    let mapping = cell.file(
+        "alarms.yaml",
+        "
+namespaces:
+  2: urn:ua-bridge:system-tests
+variables:
+  - {node: ns=2;i=30, name: Speed, type: Double, origin: 0, alarm: {high: 5, confirm: true, severity: 700}}
+  - {node: ns=2;i=31, name: Guard, type: Boolean, origin: 0, alarm: {normal: true}}
+server: {security: [None], anonymous: observer}
+",
+    );
+    let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    eventually("the server answers clients", SOON, || {
+        cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
+    });
+    let (anna, otto) = (signed_in("anna"), signed_in("otto"));
+    let mut shown = otto.events("view=alarms");
+    let first = |view: &Value| view["conditions"].get(0).cloned();
+    shown.until("the conditions are listed, none of them open", |view| {
+        (view["open"] == 0 && view["conditions"].as_array()?.len() == 2).then_some(())
+    });
+    let set = |value: &str| {
+        let written = anna.post("/write", &json!({ "topic": "ua_0_2_30", "value": value }));
+        assert_eq!(written.code, 200, "{written:?}");
+    };
+    set("7");
+    let active = shown.until("the alarm is active and first", |view| {
+        let one = first(view)?;
+        (view["open"] == 1 && one["is_active"] == true && one["level"] == "High").then_some(one)
+    });
+    assert_eq!(
+        (&active["name"], &active["severity"]),
+        (&json!("Speed"), &json!(700))
+    );
+    assert_eq!(active["is_acknowledged"], false);
+    let change = |action: &str, event: &Value| {
+        json!({
+            "condition": active["condition"], "event": event, "action": action,
+            "comment": "I look after it",
+        })
+    };
+    let acknowledge = change("acknowledge", &active["event"]);
+    assert_eq!(otto.post("/condition", &acknowledge).code, 403);
+    let stranger = Browser::of(METRICS_SERVER);
+    assert_eq!(stranger.post("/condition", &acknowledge).code, 401);
+    let forged = Browser {
+        csrf: "00".to_owned(),
+        ..signed_in("anna")
+    };
+    assert_eq!(forged.post("/condition", &acknowledge).code, 403);
+    let older = change("acknowledge", &json!("00112233445566778899aabbccddeeff"));
+    assert_eq!(anna.post("/condition", &older).code, 409);
+    let done = anna.post("/condition", &acknowledge);
+    assert_eq!(done.code, 200, "{done:?}");
+    let acknowledged = shown.until("it is acknowledged", |view| {
+        let one = first(view)?;
+        (one["is_acknowledged"] == true && one["is_confirmed"] == false).then_some(one)
+    });
+    assert_eq!(
+        (&acknowledged["user"], &acknowledged["comment"]),
+        (&json!("anna"), &json!("I look after it"))
+    );
+    assert_eq!(
+        anna.post("/condition", &acknowledge).code,
+        409,
+        "it is not done twice"
+    );
+    // An OPC UA client sees the same state.
+    let nodes = ["AckedState.Id", "ConfirmedState.Id", "ClientUserId"];
+    let read = nodes.map(|path| {
+        let node = format!("ns=1;s=ua_0_2_30.alarm|{path}");
+        cell.asyncua_once("opcua_read.py", &[SERVER_ENDPOINT, &node])[0]["value"].clone()
+    });
+    assert_eq!(read, [json!(true), json!(false), json!("anna")]);
+    set("1");
+    let normal = shown.until("the value is normal", |view| {
+        let one = first(view)?;
+        (one["is_active"] == false && view["open"] == 1).then_some(one)
+    });
+    let confirmed = anna.post("/condition", &change("confirm", &normal["event"]));
+    assert_eq!(confirmed.code, 200, "{confirmed:?}");
+    shown.until("nothing is open", |view| (view["open"] == 0).then_some(()));
 }
 
 #[test]

@@ -8,8 +8,9 @@ import * as topic from "/topic.js";
 import * as map from "/map.js";
 import * as skills from "/skills.js";
 import * as processes from "/processes.js";
+import * as alarms from "/alarms.js";
 
-const VIEWS = { programs, values, topic, map, skills, processes };
+const VIEWS = { programs, values, topic, map, skills, processes, alarms };
 const QUIET_MS = 12000;
 
 const main = document.getElementById("main");

@@ -13,6 +13,7 @@ use mappings::{Mapping, NodeIdText, SpaceId, TopicId, Variable};
 use uadp::Timestamp;
 
 use crate::announced::Description;
+use crate::operations::ConditionState;
 use crate::program::Program;
 use crate::value;
 
@@ -44,6 +45,8 @@ pub(crate) struct Board {
     /// The calls that can be requested, and whether this program executes them itself.
     pub(crate) calls: BTreeMap<TopicId, (Arc<CallDescription>, bool)>,
     pub(crate) programs: Vec<Program>,
+    /// The conditions of the program, if it has any; read while a browser shows them.
+    pub(crate) conditions: Option<Vec<ConditionState>>,
     /// The number of values of topics for which there was no room.
     pub(crate) left_out: u64,
     mapping: Option<Arc<Mapping>>,

@@ -1,4 +1,4 @@
-//! The page of the cell: programs, values, topics, skills and processes in a browser.
+//! The page of the cell: programs, values, topics, skills, processes and alarms in a browser.
 //!
 //! A program gives a [`Page`] to its run loop as observer and as site. The page learns values and
 //! calls from the run loop, and the state of programs from their `/status`. It is served beside
@@ -27,6 +27,8 @@ mod value;
 mod view;
 
 pub use fetch::{StatusUrl, StatusUrlError};
-pub use operations::{OperationFault, Operations};
+pub use operations::{
+    ConditionAction, ConditionChange, ConditionState, MOST_CONDITIONS, OperationFault, Operations,
+};
 pub use page::Page;
 pub use proxy::{ProxyUrl, ProxyUrlError};

@@ -130,7 +130,16 @@ impl Page {
     /// Returns the next event of a browser.
     pub(crate) fn next_event(&self, viewer: &mut Viewer) -> Option<String> {
         let now = self.at().since;
-        viewer.next(&mut self.board(), now)
+        // Conditions are read without the lock of the board.
+        let conditions = match viewer.shows_conditions() {
+            true => self.operations.get().map(|one| one.conditions()),
+            false => None,
+        };
+        let mut board = self.board();
+        if viewer.shows_conditions() {
+            board.conditions = conditions;
+        }
+        viewer.next(&mut board, now)
     }
 }
 

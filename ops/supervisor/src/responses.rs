@@ -55,7 +55,7 @@ const HEADERS: [(HeaderName, &str); 6] = [
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
 /// The files of the page by their paths.
-pub(crate) const FILES: [(&str, &str, &str); 12] = [
+pub(crate) const FILES: [(&str, &str, &str); 13] = [
     (
         "/",
         "text/html; charset=utf-8",
@@ -77,6 +77,7 @@ pub(crate) const FILES: [(&str, &str, &str); 12] = [
     ("/programs.js", SCRIPT, include_str!("../page/programs.js")),
     ("/values.js", SCRIPT, include_str!("../page/values.js")),
     ("/topic.js", SCRIPT, include_str!("../page/topic.js")),
+    ("/alarms.js", SCRIPT, include_str!("../page/alarms.js")),
     ("/map.js", SCRIPT, include_str!("../page/map.js")),
     ("/skills.js", SCRIPT, include_str!("../page/skills.js")),
     (

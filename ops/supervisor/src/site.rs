@@ -20,7 +20,7 @@ use subtle::ConstantTimeEq as _;
 use tracing::{info, warn};
 
 use crate::encode;
-use crate::operations::{OperationFault, Operations};
+use crate::operations::{ConditionChange, OperationFault, Operations};
 use crate::page::Page;
 use crate::proxy::ProxyUrl;
 use crate::responses::{FILES, json_page, refused, set_cookie, with_headers};
@@ -192,6 +192,10 @@ impl Page {
             "/write" => {
                 let written = body(request).await?;
                 self.write(&operations, session, written).await
+            }
+            "/condition" => {
+                let change: ConditionChange = body(request).await?;
+                change_condition(operations.as_ref(), session, &change)
             }
             _ => Err(Refusal::new(
                 StatusCode::NOT_FOUND,
@@ -409,6 +413,26 @@ impl Page {
         };
         format!("{name}={token}; Path=/; Max-Age={max_age}; HttpOnly; SameSite=Strict{secure}")
     }
+}
+
+/// Acknowledges or confirms a condition.
+fn change_condition(
+    operations: &dyn Operations,
+    session: &Session,
+    change: &ConditionChange,
+) -> Result<Response<PageBody>, Refusal> {
+    let user = &session.user;
+    let condition = value::cut(&change.condition, 200);
+    let comment = value::cut(&change.comment, 200);
+    let changed = operations.change_condition(user, change);
+    let outcome = outcome(changed.as_ref().err());
+    let action = change.action.name();
+    info!(
+        user,
+        condition, action, comment, outcome, "condition changed on the page"
+    );
+    changed.map_err(|fault| refusal(fault, user))?;
+    Ok(json_page(&json!({ "outcome": outcome })))
 }
 
 fn parse_topic(text: &str) -> Result<TopicId, Refusal> {

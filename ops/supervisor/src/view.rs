@@ -7,6 +7,7 @@ use mappings::{SpaceId, TopicId};
 use serde_json::{Map, Value, json};
 
 use crate::board::{Board, Entry, quality};
+use crate::operations;
 use crate::skill;
 use crate::value;
 
@@ -25,6 +26,8 @@ pub(crate) enum View {
     Skills,
     /// The processes of the MES.
     Processes,
+    /// The conditions of the server.
+    Alarms,
 }
 
 /// The visible rows of the list of values.
@@ -83,9 +86,10 @@ impl View {
             "map" => Self::Map,
             "skills" => Self::Skills,
             "processes" => Self::Processes,
+            "alarms" => Self::Alarms,
             other => {
                 return Err(format!(
-                    "view={other}: there are programs, values, topic, map, skills and processes"
+                    "view={other}: there are programs, values, topic, map, skills, processes and alarms"
                 ));
             }
         })
@@ -95,7 +99,9 @@ impl View {
     pub(crate) const fn period(&self) -> Duration {
         match self {
             Self::Programs | Self::Map | Self::Processes => Duration::from_secs(1),
-            Self::Values(_) | Self::Topic(_) | Self::Skills => Duration::from_millis(250),
+            Self::Values(_) | Self::Topic(_) | Self::Skills | Self::Alarms => {
+                Duration::from_millis(250)
+            }
         }
     }
 }
@@ -110,6 +116,11 @@ impl Viewer {
             last: String::new(),
             sent_at: None,
         }
+    }
+
+    /// Returns whether the browser shows the conditions.
+    pub(crate) fn shows_conditions(&self) -> bool {
+        self.view == View::Alarms
     }
 
     /// Returns the next event of the stream; `None` if nothing visible has changed.
@@ -130,6 +141,7 @@ impl Viewer {
                 self.changed(shown)
             }
             View::Processes => self.changed(processes(board)),
+            View::Alarms => self.changed(operations::alarms(board.conditions.as_deref())),
         };
         match data {
             Some(data) => {

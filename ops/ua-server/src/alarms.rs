@@ -5,7 +5,7 @@
 //!   Both are pure.
 //! - `event` and `nodes`: a condition as an event and as nodes.
 //! - `diagnostics` and `publishers`: further sources of conditions; `report`: conditions as
-//!   diagnostics of ROS; `methods`: calls of clients.
+//!   diagnostics of ROS; `methods`: calls of clients; `page`: conditions on the page.
 //!
 //! A single lock guards all conditions. While it is held, the current values are read and the
 //! subscriptions are called; the address space is written afterwards.
@@ -15,6 +15,7 @@ mod diagnostics;
 mod event;
 mod methods;
 mod nodes;
+mod page;
 mod publishers;
 mod report;
 mod trigger;

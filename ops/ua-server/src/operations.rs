@@ -11,9 +11,10 @@ use opcua::server::authenticator::UserToken;
 use opcua::server::node_manager::ParsedWriteValue;
 use opcua::types::{AttributeId, DataValue, NumericRange, StatusCode, Variant};
 use plant_opcua::users::{Access, Right, Role, Roles};
-use supervisor::{OperationFault, Operations};
+use supervisor::{ConditionChange, ConditionState, OperationFault, Operations};
 use uadp::Fields;
 
+use crate::alarms::Alarms;
 use crate::asking::Refused;
 use crate::commanders::Commander;
 use crate::layout::node_id;
@@ -25,17 +26,23 @@ pub(crate) struct PageOperations {
     access: Arc<Access>,
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
+    alarms: Arc<Alarms>,
+    /// The ApplicationUri of the server.
+    server: String,
 }
 
 impl PageOperations {
     pub(crate) fn new(
         access: Arc<Access>,
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
+        (alarms, server): (Arc<Alarms>, &str),
     ) -> Self {
         Self {
             access,
             manager,
             subscriptions,
+            alarms,
+            server: server.to_owned(),
         }
     }
 }
@@ -128,6 +135,34 @@ impl Operations for PageOperations {
             }
         })
     }
+
+    fn conditions(&self) -> Vec<ConditionState> {
+        self.alarms.states()
+    }
+
+    fn change_condition(&self, user: &str, change: &ConditionChange) -> Result<(), OperationFault> {
+        let by = (user, self.server.as_str());
+        let changed = self
+            .alarms
+            .change(change, by, (&*self.access, &*self.subscriptions));
+        changed.map_err(condition_fault)
+    }
+}
+
+/// Returns the fault of a change of a condition.
+fn condition_fault(status: StatusCode) -> OperationFault {
+    let why = match status {
+        StatusCode::BadEventIdUnknown => "the condition has changed: look at its present state",
+        StatusCode::BadNodeIdUnknown => "there is no such condition any more",
+        StatusCode::BadConditionBranchAlreadyAcked => "it is acknowledged already",
+        StatusCode::BadConditionBranchAlreadyConfirmed => "it is confirmed already",
+        StatusCode::BadConditionDisabled => "the condition is disabled",
+        StatusCode::BadMethodInvalid => "the condition is not to be confirmed",
+        StatusCode::BadOutOfRange => "the comment is too long",
+        StatusCode::BadUserAccessDenied => return OperationFault::Denied,
+        other => return OperationFault::Refused(other.to_string()),
+    };
+    OperationFault::Refused(why.to_owned())
 }
 
 /// The reason of an outcome that is not known yet.

@@ -217,7 +217,11 @@ impl ServerPort {
     pub(crate) fn operations(&self) -> PageOperations {
         let subscriptions = Arc::clone(self.handle.subscriptions());
         let nodes = (Arc::clone(self.space.manager()), subscriptions);
-        PageOperations::new(Arc::clone(&self.access), nodes)
+        let alarms = (
+            Arc::clone(&self.alarms),
+            self.described.application_uri.as_str(),
+        );
+        PageOperations::new(Arc::clone(&self.access), nodes, alarms)
     }
 
     /// Applies changes of writers and readers that clients enabled or disabled.

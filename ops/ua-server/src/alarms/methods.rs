@@ -157,4 +157,4 @@ fn audit(call: &MethodCall, kind: ObjectTypeId, source: &'static str) -> Audited
 }
 
 /// The largest comment, in bytes.
-const LONGEST_COMMENT: usize = 4096;
+pub(super) const LONGEST_COMMENT: usize = 4096;

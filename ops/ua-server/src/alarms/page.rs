@@ -1,0 +1,213 @@
+//! The conditions on the page of the server.
+
+use opcua::server::SubscriptionCache;
+use opcua::server::authenticator::UserToken;
+use opcua::types::{ByteString, LocalizedText, MethodId, NodeId, ObjectTypeId, StatusCode};
+use plant_opcua::audit::{Action as Audited, Audit};
+use plant_opcua::users::{Access, Right};
+use supervisor::{ConditionAction, ConditionChange, ConditionState, MOST_CONDITIONS};
+use uadp::Timestamp;
+
+use super::condition::{Action, Condition};
+use super::event::Identity;
+use super::methods::LONGEST_COMMENT;
+use super::{Alarms, Stamp};
+use crate::value;
+
+impl Alarms {
+    /// Returns the states of the conditions: open conditions first, by falling severity.
+    pub(crate) fn states(&self) -> Vec<ConditionState> {
+        let inner = self.inner.lock();
+        let all = inner.conditions.values();
+        let all = all.map(|entry| state(&entry.identity, &entry.condition));
+        let mut all: Vec<ConditionState> = all.collect();
+        drop(inner);
+        all.sort_by(|one, other| {
+            let key = |one: &ConditionState| (!one.is_open(), u16::MAX - one.severity);
+            key(one)
+                .cmp(&key(other))
+                .then_with(|| one.name.cmp(&other.name))
+        });
+        all.truncate(MOST_CONDITIONS);
+        all
+    }
+
+    /// Changes a condition for a user of the page, and reports it to the audit as the Method of an
+    /// OPC UA client.
+    ///
+    /// # Errors
+    /// Returns `BadUserAccessDenied`, or the status of the Method.
+    pub(crate) fn change(
+        &self,
+        change: &ConditionChange,
+        (user, server): (&str, &str),
+        (access, subscriptions): (&Access, &SubscriptionCache),
+    ) -> Result<(), StatusCode> {
+        let (method, kind, source) = match change.action {
+            ConditionAction::Acknowledge => (
+                MethodId::AcknowledgeableConditionType_Acknowledge,
+                ObjectTypeId::AuditConditionAcknowledgeEventType,
+                "Method/Acknowledge",
+            ),
+            ConditionAction::Confirm => (
+                MethodId::AcknowledgeableConditionType_Confirm,
+                ObjectTypeId::AuditConditionConfirmEventType,
+                "Method/Confirm",
+            ),
+        };
+        let (condition, event) = ids(change)?;
+        let method = NodeId::from(method);
+        // An empty comment leaves the comment of the condition as it is.
+        let comment = match change.comment.trim() {
+            "" => LocalizedText::null(),
+            text => LocalizedText::from(text),
+        };
+        let done = match access.allows(&UserToken(user.to_owned()), &method, Right::Call) {
+            false => Err(StatusCode::BadUserAccessDenied),
+            true if change.comment.len() > LONGEST_COMMENT => Err(StatusCode::BadOutOfRange),
+            true => {
+                let action = Action {
+                    user: user.to_owned(),
+                    comment: comment.clone(),
+                };
+                let act = |one: &mut Condition, stamp: Stamp| match change.action {
+                    ConditionAction::Acknowledge => one.acknowledge(&event, action, stamp),
+                    ConditionAction::Confirm => one.confirm(&event, action, stamp),
+                };
+                self.act(&condition, user, act)
+            }
+        };
+        let action = Audited::Condition {
+            source,
+            kind,
+            condition,
+            method,
+            event: Some(event),
+            comment: Some(comment),
+        };
+        let audit = Audit {
+            action,
+            status: done.err().unwrap_or(StatusCode::Good),
+            user: Audit::named(user),
+            session: None,
+            client_entry: String::new(),
+            server: server.to_owned(),
+        };
+        audit.tell(subscriptions);
+        done
+    }
+}
+
+/// Returns the NodeId of the condition and the id of the event.
+fn ids(change: &ConditionChange) -> Result<(NodeId, ByteString), StatusCode> {
+    let condition = change.condition.parse();
+    let condition = condition.map_err(|_| StatusCode::BadNodeIdUnknown)?;
+    let event = bytes(&change.event).ok_or(StatusCode::BadEventIdUnknown)?;
+    Ok((condition, ByteString::from(event)))
+}
+
+fn state(identity: &Identity, condition: &Condition) -> ConditionState {
+    let state = condition.state();
+    let time = Timestamp {
+        time: value::ticks(state.event.time),
+        picoseconds: 0,
+    };
+    let id = state.event.id.as_ref();
+    ConditionState {
+        condition: identity.node.to_string(),
+        event: id.iter().map(|byte| format!("{byte:02x}")).collect(),
+        name: identity.name.clone(),
+        severity: state.severity,
+        level: state.levels.name(),
+        is_active: state.active.on,
+        is_enabled: state.enabled.on,
+        is_acknowledged: state.acked.on,
+        is_confirmed: state.confirmed.on,
+        message: state.message.clone(),
+        comment: state.comment.0.text.as_ref().to_owned(),
+        user: state.user.clone(),
+        since_ms: i64::try_from(time.unix_nanos() / 1_000_000).unwrap_or_default(),
+    }
+}
+
+/// Parses an event id in hexadecimal.
+fn bytes(text: &str) -> Option<Vec<u8>> {
+    if text.len() > LONGEST_ID || !text.is_ascii() || text.len() % 2 != 0 {
+        return None;
+    }
+    let pairs = text.as_bytes().chunks_exact(2);
+    let bytes = pairs.map(|pair| {
+        let pair = std::str::from_utf8(pair).ok()?;
+        u8::from_str_radix(pair, 16).ok()
+    });
+    bytes.collect()
+}
+
+/// The longest event id in hexadecimal.
+const LONGEST_ID: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use opcua::types::DateTime;
+
+    use super::super::condition::{Levels, Report};
+    use super::super::event::Kind;
+    use super::*;
+
+    #[test]
+    fn event_ids_are_hexadecimal() {
+        assert_eq!(bytes("00ff10"), Some(vec![0, 255, 16]));
+        for wrong in ["0", "0g", "\u{e9}", &"00".repeat(40)] {
+            assert_eq!(bytes(wrong), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_condition_is_shown_with_the_id_that_acknowledges_it() {
+        let stamp = |number: u8| Stamp {
+            time: DateTime::now(),
+            id: ByteString::from(vec![number; 16]),
+        };
+        let mut condition = Condition::new(true, 500, stamp(1));
+        let report = Report {
+            levels: Levels::HIGH,
+            severity: 700,
+            message: "Speed is 7: High".to_owned(),
+            quality: StatusCode::Good,
+        };
+        let _effect = condition.report(report, stamp(2));
+        let identity = Identity {
+            node: NodeId::new(1, "ua_0_2_30.alarm"),
+            kind: Kind::ExclusiveLevel,
+            source: NodeId::new(2, 30),
+            source_name: "Speed".to_owned(),
+            name: "Speed".to_owned(),
+            input: NodeId::new(2, 30),
+            limits: [None, None, Some(5.0), None],
+            normal: NodeId::null(),
+            confirms: true,
+            delay: Duration::ZERO,
+        };
+        let shown = state(&identity, &condition);
+        assert!(shown.is_open() && shown.is_active && !shown.is_acknowledged);
+        assert_eq!((shown.level, shown.severity), ("High", 700));
+        let change = ConditionChange {
+            condition: shown.condition.clone(),
+            event: shown.event,
+            action: ConditionAction::Acknowledge,
+            comment: String::new(),
+        };
+        let (node, event) = ids(&change).unwrap();
+        assert_eq!(node, identity.node);
+        let action = Action {
+            user: "anna".to_owned(),
+            comment: LocalizedText::null(),
+        };
+        condition.acknowledge(&event, action, stamp(3)).unwrap();
+        let shown = state(&identity, &condition);
+        assert!(shown.is_acknowledged && !shown.is_confirmed);
+        assert_eq!(shown.user, "anna");
+    }
+}
