@@ -63,6 +63,7 @@ mod sharing;
 mod shipped_mappings;
 mod skills;
 mod space_verbs;
+mod space_write;
 mod turtlebot3;
 mod uadp_differential;
 mod withdrawn_goals;

@@ -4,6 +4,7 @@ mod cell;
 mod discover;
 mod live;
 mod recording;
+mod write;
 
 pub(crate) use cell::{Doctor, New, StatusArguments, Template};
 pub(crate) use discover::{Discover, Look};
@@ -12,6 +13,7 @@ pub(crate) use live::{
     SourceAt, SourceVerb, Target, Top, Trace, Types, WatchSkills,
 };
 pub(crate) use recording::{Record, Replay, Viewers};
+pub(crate) use write::Write;
 
 use std::path::PathBuf;
 
@@ -192,6 +194,17 @@ pub(crate) enum Verb {
     /// usage, or a parameter is missing or wrong, 69 the call has no executor, or its outcome is
     /// unknown, 74 the output cannot be written, 130 interrupted.
     Call(Call),
+    /// Write a value of the OPC UA side (origin 0), as an OPC UA client does
+    ///
+    /// Beside a ua-server that has the value, it is written at this server, with the permissions of
+    /// --user. Without a server it is sent to the group, by the mapping of the cell. The value is
+    /// sent at once and delivered once. Bridges confirm a command (`confirm` in the mapping).
+    ///
+    /// Exit codes: 0 written, and confirmed where the mapping says so, 1 refused, and nothing was
+    /// sent, 64 usage, or the value is wrong, 69 nothing has the value, or its outcome is unknown, 74
+    /// the output cannot be written, 78 the mapping cannot run, 130 interrupted.
+    #[command(visible_alias = "pub")]
+    Write(Write),
     /// Show the delays of values, hop by hop
     ///
     /// Shows the delays that programs measured (at the address of their --metrics), and those of

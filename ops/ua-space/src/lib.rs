@@ -93,6 +93,10 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Record(arguments) => live::record(arguments),
         Verb::Replay(arguments) => live::replay(arguments),
         Verb::Live(arguments) => live::serve(arguments),
+        Verb::Write(arguments) => match live::write(arguments) {
+            Ok(code) => return code,
+            Err(failure) => Err(failure),
+        },
         Verb::Page(_) => return page::page(given),
         Verb::Ask(arguments) => ask::ask(arguments),
         Verb::Source(arguments) => source::source(arguments),

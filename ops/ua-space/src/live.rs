@@ -25,6 +25,7 @@ mod structure;
 mod text;
 mod top;
 mod trace;
+mod write;
 
 pub(crate) use all::list;
 pub(crate) use application::Application;
@@ -41,6 +42,7 @@ pub(crate) use skills::{HeardNames, heard_names, skills, types};
 pub(crate) use text::{Table, harmless, is_coloured, wrapped};
 pub(crate) use top::{Sort, top};
 pub(crate) use trace::trace;
+pub(crate) use write::write;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -396,7 +398,7 @@ fn take(
 }
 
 #[expect(clippy::disallowed_methods, reason = "the one read of this clock")]
-fn unix_nanos() -> i128 {
+pub(crate) fn unix_nanos() -> i128 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     i128::try_from(since.unwrap_or_default().as_nanos()).unwrap_or_default()
 }

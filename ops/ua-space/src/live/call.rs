@@ -3,7 +3,7 @@
 
 mod executor;
 mod goal;
-mod words;
+pub(in crate::live) mod words;
 
 use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::io::{self, Write as _};

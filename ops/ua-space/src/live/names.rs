@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use mappings::TopicId;
+use mappings::{Mapping, TopicId, Variable};
 
 use super::book::{Book, Kind, News};
 use super::described::Described;
@@ -67,7 +67,11 @@ fn find_named(book: &Book, name: &str, kind: Option<Kind>) -> Vec<Candidate> {
 }
 
 fn fit(described: &Described, name: &str) -> Option<Fit> {
-    let names = described.names();
+    best_fit(described.names(), name)
+}
+
+/// Returns how well the best of several names fits.
+fn best_fit<'n>(names: impl Iterator<Item = &'n str>, name: &str) -> Option<Fit> {
     let fits = names.map(|known| {
         let ends = |known: &str, name: &str| {
             let before = known.strip_suffix(name);
@@ -83,6 +87,23 @@ fn fit(described: &Described, name: &str) -> Option<Fit> {
         }
     });
     fits.flatten().min()
+}
+
+/// Returns the variables of a mapping that fit the target best.
+pub(super) fn mapped<'m>(mapping: &'m Mapping, target: &Target) -> Vec<&'m Variable> {
+    let name = match target {
+        Target::Topic(topic) => return mapping.variable(*topic).into_iter().collect(),
+        Target::Name(name) => name,
+    };
+    let fits = mapping.variables().iter().filter_map(|variable| {
+        let ros = variable.ros_names().map(|(_, name)| name);
+        let fit = best_fit(std::iter::once(variable.name.as_str()).chain(ros), name)?;
+        Some((fit, variable))
+    });
+    let fits: Vec<(Fit, &Variable)> = fits.collect();
+    let best = fits.iter().map(|(fit, _)| *fit).min();
+    let best = fits.into_iter().filter(|(fit, _)| Some(*fit) == best);
+    best.map(|(_, variable)| variable).collect()
 }
 
 /// Returns the name and the ROS topics of a topic for output.

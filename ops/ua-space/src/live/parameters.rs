@@ -1,4 +1,4 @@
-//! Encodes `name=value` arguments as the request of a call, by the types of the call.
+//! Encodes `name=value` arguments as the request of a call or as a value, by the announced types.
 
 use serde_json::{Value, json};
 use uadp::BuiltinType;
@@ -22,11 +22,20 @@ pub(crate) struct WrongParameter {
 /// [`WrongParameter`] names the first wrong argument or the missing parameters, and lists the
 /// parameters of the call.
 pub(crate) fn request(words: &[String], takes: &[Field]) -> Result<Vec<u8>, WrongParameter> {
+    encoded(words, takes, "call")
+}
+
+/// Encodes the fields of a call or a value, which `subject` names for errors; see [`request`].
+pub(super) fn encoded(
+    words: &[String],
+    takes: &[Field],
+    subject: &str,
+) -> Result<Vec<u8>, WrongParameter> {
     let wrong = |what: String| WrongParameter {
         what,
         help: match takes {
-            [] => "this call takes nothing".to_owned(),
-            _ => format!("this call takes {}", list(takes)),
+            [] => format!("this {subject} takes nothing"),
+            _ => format!("this {subject} takes {}", list(takes)),
         },
     };
     let mut given: Vec<Option<Value>> = vec![None; takes.len()];

@@ -1,4 +1,5 @@
-//! Parses the arguments of a goal: `name=value`, or the whole goal as YAML in one word.
+//! Parses the arguments of a goal or a message: `name=value`, or the whole message as YAML in one
+//! word.
 
 use granit_parser::{Event, Parser};
 use serde_json::{Value, json};
@@ -25,7 +26,7 @@ pub(super) fn own<'n>(name: &'n str, part: &str) -> &'n str {
     rest.unwrap_or(name)
 }
 
-/// Returns the arguments as `name=value`. With `fills`, missing fields get the default values of a
+/// Returns the arguments of a goal as `name=value`. With `fills`, missing fields get the default values of a
 /// ROS message.
 ///
 /// # Errors
@@ -35,11 +36,27 @@ pub(super) fn spelled(
     takes: &[Field],
     fills: bool,
 ) -> Result<Vec<String>, String> {
+    let typed: Vec<String> = typed
+        .iter()
+        .map(|word| own(word, GOAL).to_owned())
+        .collect();
+    message(&typed, takes, fills)
+}
+
+/// Returns the fields of a message as `name=value`, as [`spelled`] does for a goal.
+///
+/// # Errors
+/// A description of the argument that cannot be parsed.
+pub(in crate::live) fn message(
+    typed: &[String],
+    takes: &[Field],
+    fills: bool,
+) -> Result<Vec<String>, String> {
     let mut words = Vec::new();
     for word in typed {
         match word.trim_start().starts_with('{') {
             true => flatten(&yaml(word)?, "", &mut words),
-            false => words.push(own(word, GOAL).to_owned()),
+            false => words.push(word.clone()),
         }
     }
     if fills {
@@ -124,7 +141,7 @@ fn yaml(text: &str) -> Result<Value, String> {
     let mut open: Vec<(bool, Vec<Value>)> = Vec::new();
     let mut root = None;
     for event in Parser::new_from_str_with_options(text, options) {
-        let (event, _) = event.map_err(|error| format!("the goal is no YAML: {error}"))?;
+        let (event, _) = event.map_err(|error| format!("the value is not YAML: {error}"))?;
         let value = match event {
             Event::Scalar(text, ..) => Value::String(text.into_owned()),
             Event::SequenceStart(..) => {
@@ -156,7 +173,7 @@ fn yaml(text: &str) -> Result<Value, String> {
     }
     match root {
         Some(value @ Value::Object(_)) => Ok(value),
-        Some(_) | None => Err("the goal is a map, as {order: 5}".to_owned()),
+        Some(_) | None => Err("the value is not a map, as {order: 5}".to_owned()),
     }
 }
 
@@ -168,7 +185,7 @@ fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, String> {
     let mut values = values.into_iter();
     while let (Some(name), Some(value)) = (values.next(), values.next()) {
         let Value::String(name) = name else {
-            return Err("the names in a goal are texts".to_owned());
+            return Err("the names in a map are texts".to_owned());
         };
         if fields.insert(name.clone(), value).is_some() {
             return Err(format!("`{name}` is given twice"));
@@ -181,7 +198,7 @@ fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, String> {
 pub(super) const GOAL_ID: &str = "goal_id";
 /// The prefix of the fields of a goal.
 const GOAL: &str = "goal";
-const NO_ALIAS: &str = "the goal is YAML of lists, maps and single values";
+const NO_ALIAS: &str = "the value may have lists, maps and single values only";
 const MOST_DEEP: usize = 32;
 /// Maximum number of default elements of a fixed-length array.
 const MOST_ELEMENTS: usize = 10_000;

@@ -1,0 +1,220 @@
+//! The typed value of a command line.
+
+use mappings::Variable;
+use messages::Rank;
+use serde_json::Value;
+use uadp::{BuiltinType, Timestamp};
+
+use super::super::call::words;
+use super::super::described::{Field, Meaning};
+use super::super::parameters;
+use crate::iso_time;
+
+/// Encodes the value as the fields of a DataSet: their number, then a Variant for each field. `now`
+/// is the present time in nanoseconds since 1970, for the stamp of a message.
+///
+/// # Errors
+/// The reason why the value does not fit the fields.
+pub(super) fn encoded(given: &[String], fields: &[Field], now: i128) -> Result<Vec<u8>, String> {
+    let words = match (fields, given) {
+        ([], _) => return Err("its type is not known".to_owned()),
+        ([only], [text]) => vec![single(text, only)],
+        ([_], _) => {
+            return Err(format!(
+                "a single value is expected, and {} are given",
+                given.len()
+            ));
+        }
+        (_, _) => parts(given, fields, now)?,
+    };
+    in_range(&words, fields)?;
+    parameters::encoded(&words, fields, "value").map_err(|wrong| wrong.to_string())
+}
+
+/// Returns the only field as `name=value`.
+fn single(text: &str, field: &Field) -> String {
+    let name = &field.name;
+    let own = format!("{name}=");
+    let text = match name.is_empty() {
+        true => text,
+        false => text.strip_prefix(&own).unwrap_or(text),
+    };
+    // A quoted text of YAML or JSON.
+    let quoted = text
+        .starts_with('"')
+        .then(|| serde_json::from_str(text).ok());
+    match quoted.flatten() {
+        Some(Value::String(inner)) => format!("{name}={inner}"),
+        Some(_) | None => format!("{name}={text}"),
+    }
+}
+
+/// Returns the parts of a message as `name=value`. Missing parts are zero, and a missing stamp is
+/// `now`.
+fn parts(given: &[String], fields: &[Field], now: i128) -> Result<Vec<String>, String> {
+    let mut words = words::message(given, fields, false)?;
+    let has = |name: &str| {
+        let mut names = words.iter().filter_map(|word| word.split_once('='));
+        names.any(|(of, _)| of == name)
+    };
+    let is_stamp = |field: &&Field| {
+        field.name == STAMP && field.builtin == Some(BuiltinType::DateTime) && !field.is_array()
+    };
+    if fields.iter().any(|field| is_stamp(&field)) && !has(STAMP) {
+        let now = iso_time::of_date_time(Timestamp::from_unix_nanos(now).time);
+        words.push(format!("{STAMP}={now}"));
+    }
+    words::message(&words, fields, true)
+}
+
+/// Checks the numbers of fields with a range.
+fn in_range(words: &[String], fields: &[Field]) -> Result<(), String> {
+    for word in words {
+        let Some((name, text)) = word.split_once('=') else {
+            continue;
+        };
+        let field = fields.iter().find(|field| field.name == name);
+        let Some((low, high)) = field.and_then(|field| field.meaning.range) else {
+            continue;
+        };
+        let list = text.trim_matches(['[', ']']).split(',');
+        let mut numbers = list.filter_map(|one| one.trim().trim_matches('"').parse::<f64>().ok());
+        if let Some(wrong) = numbers.find(|one| !(low..=high).contains(one)) {
+            return Err(format!("{wrong} is out of the range {low} to {high}"));
+        }
+    }
+    Ok(())
+}
+
+/// Returns the fields of a variable of a mapping; empty if its type is not known.
+pub(super) fn fields_of(variable: &Variable) -> Vec<Field> {
+    let field = |name: &str, builtin, size: Option<Option<u32>>| Field {
+        name: name.to_owned(),
+        builtin: Some(builtin),
+        rank: size.map_or(-1, |_| 1),
+        dimensions: size
+            .map(|size| vec![size.unwrap_or_default()])
+            .unwrap_or_default(),
+        max_string_length: 0,
+        description: String::new(),
+        meaning: Meaning::default(),
+        optional: false,
+        structure: None,
+    };
+    if let Some((builtin, is_array)) = variable.value_type {
+        let only = field(&variable.name, builtin, is_array.then_some(None));
+        let range = variable.meaning.range();
+        let meaning = Meaning {
+            range,
+            ..Meaning::default()
+        };
+        return vec![Field { meaning, ..only }];
+    }
+    let fields = variable.fields.iter().map(|leaf| {
+        let size = match leaf.rank {
+            Rank::Scalar => None,
+            Rank::Array { fixed } => Some(fixed),
+        };
+        field(&leaf.path, leaf.builtin, size)
+    });
+    fields.collect()
+}
+
+/// The time of the header of a message.
+const STAMP: &str = "header.stamp";
+
+#[cfg(test)]
+mod tests {
+    use uadp::Fields;
+
+    use super::*;
+    use crate::live::plain;
+
+    fn field(name: &str, builtin: BuiltinType, size: Option<u32>) -> Field {
+        Field {
+            name: name.to_owned(),
+            builtin: Some(builtin),
+            rank: size.map_or(-1, |_| 1),
+            dimensions: size.into_iter().collect(),
+            max_string_length: 0,
+            description: String::new(),
+            meaning: Meaning::default(),
+            optional: false,
+            structure: None,
+        }
+    }
+
+    fn of(given: &[&str], fields: &[Field]) -> Result<Vec<Value>, String> {
+        let given: Vec<String> = given.iter().map(|word| (*word).to_owned()).collect();
+        let block = encoded(&given, fields, 1_700_000_000_123_456_789)?;
+        let values = Fields::parse(&block).unwrap().map(Result::unwrap);
+        Ok(values
+            .map(|value| plain::variant(&value).unwrap())
+            .collect())
+    }
+
+    #[test]
+    fn a_single_value_needs_no_name_and_has_the_type_of_its_field() {
+        let speed = [field("Line.Speed", BuiltinType::Double, None)];
+        assert_eq!(of(&["1"], &speed).unwrap(), [1.0]);
+        assert_eq!(of(&["-0.5"], &speed).unwrap(), [-0.5]);
+        assert_eq!(of(&["Line.Speed=2"], &speed).unwrap(), [2.0]);
+        let text = [field("Text", BuiltinType::String, None)];
+        assert_eq!(of(&["a=b {c}"], &text).unwrap(), ["a=b {c}"]);
+        assert_eq!(of(&[r#""1""#], &text).unwrap(), ["1"]);
+        let list = [field("Joints", BuiltinType::Float, Some(2))];
+        assert_eq!(
+            of(&["[1, 2.5]"], &list).unwrap(),
+            [serde_json::json!([1.0, 2.5])]
+        );
+        for (given, fields, why) in [
+            (&["fast"][..], &speed[..], "expected a Double, found `fast`"),
+            (
+                &["1", "2"],
+                &speed,
+                "a single value is expected, and 2 are given",
+            ),
+            (&["1,2,3"], &list, "takes 2 values, and 3 are given"),
+            (&["1"], &[], "its type is not known"),
+        ] {
+            let wrong = of(given, fields).unwrap_err();
+            assert!(wrong.contains(why), "{given:?}: {wrong}");
+        }
+    }
+
+    #[test]
+    fn parts_of_a_message_are_given_by_path_or_as_a_map_and_others_are_zero() {
+        let twist = [
+            field("header.stamp", BuiltinType::DateTime, None),
+            field("twist.linear.x", BuiltinType::Double, None),
+            field("twist.angular.z", BuiltinType::Double, None),
+        ];
+        let stamp = "2023-11-14T22:13:20.1234567Z";
+        let wanted = [Value::from(stamp), 0.5.into(), 0.0.into()];
+        for given in [
+            &["twist.linear.x=0.5"][..],
+            &["{twist: {linear: {x: 0.5}}}"],
+            &[r#"{"twist": {"linear": {"x": 0.5}}}"#],
+        ] {
+            assert_eq!(of(given, &twist).unwrap(), wanted, "{given:?}");
+        }
+        let wrong = of(&["linear.x=1"], &twist).unwrap_err();
+        assert!(
+            wrong.contains("there is no parameter `linear.x`"),
+            "{wrong}"
+        );
+        assert!(wrong.contains("this value takes header.stamp"), "{wrong}");
+    }
+
+    #[test]
+    fn numbers_out_of_the_range_are_refused() {
+        let mut speed = field("Speed", BuiltinType::Double, None);
+        speed.meaning.range = Some((0.0, 2.0));
+        assert!(of(&["2"], std::slice::from_ref(&speed)).is_ok());
+        let wrong = of(&["2.5"], std::slice::from_ref(&speed)).unwrap_err();
+        assert_eq!(wrong, "2.5 is out of the range 0 to 2");
+        let mut list = field("Joints", BuiltinType::Double, Some(2));
+        list.meaning.range = Some((0.0, 2.0));
+        assert!(of(&["[1, -1]"], &[list]).is_err());
+    }
+}
