@@ -7,7 +7,7 @@ mod processes;
 
 pub(crate) use doctor::doctor;
 pub(crate) use overview::status;
-pub(crate) use pages::Page;
+pub(crate) use pages::{HopPage, Page, TopicPage, of_url as page_of_url};
 pub(crate) use processes::own_drops;
 
 /// Returns the status pages of the programs on this host.

@@ -232,10 +232,25 @@ pub(crate) struct Trace {
     /// Ask the program with this address of --metrics. May be repeated
     #[arg(long, value_name = "URL")]
     pub(crate) metrics: Vec<String>,
-    /// Time to listen in the group; 0 asks the programs only
-    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds_or_none)]
-    pub(crate) seconds: f64,
-    /// Print a JSON object
+    /// Time to listen in the group; 0 asks the programs only. Without it: 3 s, or with --follow
+    /// until Ctrl-C
+    #[arg(long, value_name = "SECONDS", value_parser = seconds_or_none)]
+    pub(crate) seconds: Option<f64>,
+    /// Show the delays of each sample of this topic: ua_1_2_10, or its name
+    #[arg(long, value_name = "TOPIC|NAME", conflicts_with = "metrics")]
+    pub(crate) follow: Option<Target>,
+    /// Write the samples as a trace of Perfetto: a track for each hop of a topic, and a flow for
+    /// each sample
+    #[arg(long, value_name = "FILE")]
+    pub(crate) perfetto: Option<PathBuf>,
+    /// Write a drawing of the delays of each topic: the hops as a waterfall, and their distribution
+    #[arg(long, value_name = "FILE")]
+    pub(crate) svg: Option<PathBuf>,
+    /// Send the counters and delays of programs as metrics of OpenTelemetry (OTLP over HTTP) to this
+    /// collector, as http://127.0.0.1:4318, every --seconds (10), until Ctrl-C
+    #[arg(long, value_name = "URL", conflicts_with_all = ["follow", "perfetto", "svg", "json"])]
+    pub(crate) otlp: Option<String>,
+    /// Print a JSON object, or with --follow a JSON object for each sample
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]

@@ -4,8 +4,16 @@
 //! to this program are computed from the times in its messages: the time at which its writer took
 //! the value, the time of sending, and the time of arrival.
 
+mod drawing;
+mod follow;
+mod otlp;
+mod perfetto;
+mod protobuf;
+
 use std::collections::{BTreeMap, VecDeque};
+use std::fs;
 use std::io::{self, Write as _};
+use std::path::Path;
 
 use mappings::TopicId;
 use serde::{Deserialize, Serialize};
@@ -23,27 +31,39 @@ use crate::survey::look;
 
 /// Runs `ua-space trace`.
 pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
+    if let Some(target) = &arguments.follow {
+        return follow::follow(arguments, target);
+    }
+    if let Some(url) = &arguments.otlp {
+        return look(otlp::export(arguments, url));
+    }
+    let seconds = arguments.seconds.unwrap_or(USUAL);
     let mut topics = Vec::new();
-    if arguments.seconds > 0.0 {
+    if seconds > 0.0 {
         topics = in_group(&arguments.group, async |mut live| {
-            let end = until(live.now(), Some(arguments.seconds));
+            let end = until(live.now(), Some(seconds));
             let start = live.start_utc();
-            let mut delays = Delays::default();
+            let (mut delays, mut samples) = (Delays::default(), Samples::of(arguments));
             live.listen(end, &mut |news, now| {
                 if let News::Sample(sample) = &news {
-                    let arrived = start + i128::try_from(now.as_nanos()).unwrap_or(i128::MAX / 2);
-                    delays.take(sample, arrived);
+                    samples.take(delays.take(sample, arrival(start, now)));
                 }
                 Go::On
             })
             .await?;
             live.tell_dropped();
+            let name_of = |topic: TopicId| live.name_of(topic);
+            samples.write(arguments, &delays, &name_of)?;
             let mut rows = delays.rows();
             for row in &mut rows {
-                row.name = row.topic.parse().ok().and_then(|topic| live.name_of(topic));
+                row.name = row.topic.parse().ok().and_then(name_of);
             }
             Ok(rows)
         })?;
+    } else if arguments.perfetto.is_some() || arguments.svg.is_some() {
+        return Err(Failure::Usage(
+            "--perfetto and --svg need samples: give another --seconds than 0".to_owned(),
+        ));
     }
     let servers: Vec<Server> = arguments
         .metrics
@@ -65,6 +85,95 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
         Some(_) => Err(Failure::NotThere),
         None => Ok(()),
     }
+}
+
+/// Returns the time of an arrival in nanoseconds since 1970, from the start of listening and the
+/// time since then.
+fn arrival(start: i128, now: std::time::Duration) -> i128 {
+    start + i128::try_from(now.as_nanos()).unwrap_or(i128::MAX / 2)
+}
+
+/// The times of a message, in nanoseconds since 1970.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Times {
+    topic: TopicId,
+    sequence: Option<u16>,
+    /// The time at which its writer took the value; `None` for a repeated value.
+    taken: Option<i128>,
+    sent: Option<i128>,
+    arrived: i128,
+}
+
+impl Times {
+    /// Returns the time in the program of the writer, in nanoseconds.
+    fn origin(&self) -> Option<i128> {
+        Some(self.sent? - self.taken?)
+    }
+
+    /// Returns the time from the writer to here, in nanoseconds.
+    fn network(&self) -> Option<i128> {
+        Some(self.arrived - self.sent?)
+    }
+}
+
+/// The samples to write into a file.
+#[derive(Debug)]
+struct Samples {
+    /// `None` if no file is wanted.
+    kept: Option<Vec<Times>>,
+    /// The number of samples for which there was no room.
+    left_out: u64,
+}
+
+impl Samples {
+    fn of(arguments: &Trace) -> Self {
+        Self {
+            kept: arguments.perfetto.is_some().then(Vec::new),
+            left_out: 0,
+        }
+    }
+
+    fn take(&mut self, times: Option<Times>) {
+        if let (Some(kept), Some(times)) = (&mut self.kept, times) {
+            match kept.len() < MOST_SAMPLES {
+                true => kept.push(times),
+                false => self.left_out += 1,
+            }
+        }
+    }
+
+    /// Writes the files of the command line.
+    fn write(
+        &self,
+        arguments: &Trace,
+        delays: &Delays,
+        name_of: &dyn Fn(TopicId) -> Option<String>,
+    ) -> Result<(), Failure> {
+        if let (Some(path), Some(kept)) = (&arguments.perfetto, &self.kept) {
+            let (bytes, crowded) = perfetto::trace(kept, name_of);
+            write_file(path, &bytes)?;
+            for (count, why) in [
+                (self.left_out, "beyond the largest number of samples"),
+                (crowded, "in flight at the same time as too many others"),
+            ] {
+                if count > 0 {
+                    warn(&format!(
+                        "{}: {count} samples are left out: {why}",
+                        path.display()
+                    ));
+                }
+            }
+        }
+        match &arguments.svg {
+            Some(path) => write_file(path, drawing::svg(delays, name_of).as_bytes()),
+            None => Ok(()),
+        }
+    }
+}
+
+fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    let name = path.display();
+    fs::write(path, bytes).map_err(|error| Failure::Io(format!("cannot write {name}: {error}")))
 }
 
 /// The measurements of a program.
@@ -147,12 +256,13 @@ struct Window {
 }
 
 impl Delays {
-    /// Records a message that arrived at the given time, in nanoseconds since 1970.
-    fn take(&mut self, sample: &Sample<'_>, arrived: i128) {
+    /// Records a message that arrived at the given time, in nanoseconds since 1970. Returns its
+    /// times; `None` for a message without a value, and beyond the largest number of topics.
+    fn take(&mut self, sample: &Sample<'_>, arrived: i128) -> Option<Times> {
         if sample.message.kind == MessageKind::KeepAlive
             || (self.topics.len() >= MOST_TOPICS && !self.topics.contains_key(&sample.topic))
         {
-            return;
+            return None;
         }
         let topic = self.topics.entry(sample.topic).or_default();
         let header = sample.message.header();
@@ -166,15 +276,22 @@ impl Delays {
         let taken = nanos(header.timestamp, header.picoseconds);
         let sent = nanos(sample.network.timestamp, sample.network.picoseconds);
         let before = std::mem::replace(&mut topic.taken, taken);
-        if let (Some(taken), Some(sent)) = (taken, sent)
-            // The first received message may be a repetition too.
-            && before.is_some_and(|before| before != taken)
-        {
-            topic.origin.record(sent - taken);
+        // The first received message may be a repetition too.
+        let is_new = before.is_some() && before != taken;
+        let times = Times {
+            topic: sample.topic,
+            sequence: sample.message.sequence_number(),
+            taken: taken.filter(|_| is_new),
+            sent,
+            arrived,
+        };
+        if let Some(delay) = times.origin() {
+            topic.origin.record(delay);
         }
-        if let Some(sent) = sent {
-            topic.network.record(arrived - sent);
+        if let Some(delay) = times.network() {
+            topic.network.record(delay);
         }
+        Some(times)
     }
 
     fn rows(&self) -> Vec<Row> {
@@ -305,7 +422,11 @@ fn called(hop: &str) -> String {
 
 const ORIGIN: &str = "origin";
 const NETWORK: &str = "network";
+/// The usual time to listen, in seconds.
+const USUAL: f64 = 3.0;
 const MOST_TOPICS: usize = 1024;
+/// The largest number of samples in a file.
+const MOST_SAMPLES: usize = 200_000;
 /// Maximum number of delays of a topic and hop in the statistics.
 const MOST_DELAYS: usize = 2048;
 
