@@ -1,4 +1,5 @@
-//! `ua-space write` with a robot of rospy behind its bridge: by a mapping alone, and at a ua-server.
+//! `ua-space write` with a robot of rospy behind its bridge: by a mapping alone, and at a
+//! ua-server.
 
 use std::time::Duration;
 

@@ -201,8 +201,8 @@ pub(crate) enum Verb {
     /// sent at once and delivered once. Bridges confirm a command (`confirm` in the mapping).
     ///
     /// Exit codes: 0 written, and confirmed where the mapping says so, 1 refused, and nothing was
-    /// sent, 64 usage, or the value is wrong, 69 nothing has the value, or its outcome is unknown, 74
-    /// the output cannot be written, 78 the mapping cannot run, 130 interrupted.
+    /// sent, 64 usage, or the value is wrong, 69 nothing has the value, or its outcome is unknown,
+    /// 74 the output cannot be written, 78 the mapping cannot run, 130 interrupted.
     #[command(visible_alias = "pub")]
     Write(Write),
     /// Show the delays of values, hop by hop

@@ -246,8 +246,8 @@ pub(crate) struct Trace {
     /// Write a drawing of the delays of each topic: the hops as a waterfall, and their distribution
     #[arg(long, value_name = "FILE")]
     pub(crate) svg: Option<PathBuf>,
-    /// Send the counters and delays of programs as metrics of OpenTelemetry (OTLP over HTTP) to this
-    /// collector, as http://127.0.0.1:4318, every --seconds (10), until Ctrl-C
+    /// Send the counters and delays of programs as metrics of OpenTelemetry (OTLP over HTTP) to
+    /// this collector, as http://127.0.0.1:4318, every --seconds (10), until Ctrl-C
     #[arg(long, value_name = "URL", conflicts_with_all = ["follow", "perfetto", "svg", "json"])]
     pub(crate) otlp: Option<String>,
     /// Print a JSON object, or with --follow a JSON object for each sample

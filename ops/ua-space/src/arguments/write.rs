@@ -12,7 +12,8 @@ pub(crate) struct Write {
     #[arg(value_name = "TOPIC|NAME")]
     pub(crate) target: Target,
     /// The value, as 0.5, true, text or [1, 2]. Parts of a message as linear.x=0.5, or as YAML or
-    /// JSON, '{linear: {x: 0.5}}'. Parts that are left out are zero, and a stamp is the present time
+    /// JSON, '{linear: {x: 0.5}}'. Parts that are left out are zero, and a stamp is the present
+    /// time
     #[arg(value_name = "VALUE", required = true, allow_negative_numbers = true)]
     pub(crate) values: Vec<String>,
     /// Write the value again at this rate, until Ctrl-C or --count

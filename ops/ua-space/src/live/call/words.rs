@@ -26,8 +26,8 @@ pub(super) fn own<'n>(name: &'n str, part: &str) -> &'n str {
     rest.unwrap_or(name)
 }
 
-/// Returns the arguments of a goal as `name=value`. With `fills`, missing fields get the default values of a
-/// ROS message.
+/// Returns the arguments of a goal as `name=value`. With `fills`, missing fields get the default
+/// values of a ROS message.
 ///
 /// # Errors
 /// A description of the argument that cannot be parsed.

@@ -1,5 +1,5 @@
-//! A trace file of Perfetto: a track for each hop of a topic, and a flow for each sample. The format
-//! is a protobuf message `Trace`, written by hand because few fields are needed.
+//! A trace file of Perfetto: a track for each hop of a topic, and a flow for each sample. The
+//! format is a protobuf message `Trace`, written by hand because few fields are needed.
 
 use std::collections::BTreeMap;
 
