@@ -13,6 +13,7 @@ mod malformed;
 mod nodesets;
 mod pubsub;
 mod quality;
+mod services;
 mod strangers;
 
 use std::{

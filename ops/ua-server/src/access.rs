@@ -17,8 +17,8 @@ use crate::layout::{Layout, node_id};
 
 /// Records, for each session, if its ApplicationUri matches its certificate.
 ///
-/// The library does not compare the two when a session is created (OPC 10000-4, 5.6.2). The space
-/// refuses every request of a session with the ApplicationUri of another application.
+/// The unpatched library does not compare the two when a session is created (OPC 10000-4, 5.7.2).
+/// The space refuses every request of a session with the ApplicationUri of another application.
 #[derive(Default)]
 pub(crate) struct Genuine(Mutex<HashMap<u32, bool>>);
 

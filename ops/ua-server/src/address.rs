@@ -33,6 +33,8 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
     .description(LocalizedText::from(description))
     .data_type(type_)
     .value_rank(rank)
+    .array_dimensions(&dimensions(rank))
+    .minimum_sampling_interval(ON_CHANGE)
     .access_level(access)
     .user_access_level(access)
     .historizing(topic.historizing)
@@ -51,6 +53,8 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
         )
         .data_type(field.data_type())
         .value_rank(field.shape.value_rank())
+        .array_dimensions(&dimensions(field.shape.value_rank()))
+        .minimum_sampling_interval(ON_CHANGE)
         .access_level(access)
         .user_access_level(access)
         .historizing(topic.historizing)
@@ -65,8 +69,17 @@ pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: Sha
     if let Some(NodeType::Variable(variable)) = address_space.find_mut(node) {
         variable.set_data_type(shape.data_type());
         variable.set_value_rank(shape.value_rank());
+        variable.set_array_dimensions(&dimensions(shape.value_rank()));
     }
 }
+
+/// Returns the ArrayDimensions of arrays of any length (OPC 10000-3, 5.6.2).
+fn dimensions(rank: i32) -> Vec<u32> {
+    vec![0; usize::try_from(rank).unwrap_or_default()]
+}
+
+/// The MinimumSamplingInterval of values that are reported on change.
+const ON_CHANGE: f64 = 0.0;
 
 pub(crate) fn access(topic: &TopicNode) -> AccessLevel {
     let mut level = AccessLevel::CURRENT_READ;

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
-use opcua::server::address_space::AddressSpace;
+use opcua::server::address_space::{AddressSpace, NodeType};
 use opcua::server::authenticator::UserToken;
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{InMemoryNodeManager, InMemoryNodeManagerImpl};
@@ -23,7 +23,7 @@ use opcua::server::node_manager::{
 use opcua::server::{CreateMonitoredItem, MonitoredItemHandle, SubscriptionCache};
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
-    AttributeId, DataValue, DateTime, NodeId, NumericRange, ReadAtTimeDetails,
+    AttributeId, DataEncoding, DataValue, DateTime, NodeId, NumericRange, ReadAtTimeDetails,
     ReadProcessedDetails, ReadRawModifiedDetails, StatusCode, TimestampsToReturn, Variant,
 };
 use plant_opcua::nodeset::NodeSets;
@@ -415,10 +415,10 @@ impl SpaceNodes {
         kept
     }
 
-    /// Notifies the monitored items of a node. For an item without a filter the server compares
-    /// values only, although a changed status has to be reported too (OPC 10000-4, 7.22.2: the
-    /// default trigger is StatusValue). A DataValue without a value in between makes the server
-    /// report both; clients with a queue size of 1 see only the second.
+    /// Notifies the monitored items of a node. For an item without a filter the unpatched library
+    /// compares values only, although a changed status has to be reported too (OPC 10000-4, 7.22.2:
+    /// the default trigger is StatusValue). A DataValue without a value in between makes it report
+    /// both; clients with a queue size of 1 see only the second.
     fn notify(
         &self,
         subscriptions: &SubscriptionCache,
@@ -430,7 +430,9 @@ impl SpaceNodes {
         let Some(mut items) = notifier.notify_for(node, AttributeId::Value) else {
             return;
         };
-        let flipped = before.stamp().status != view.stamp().status && before.has_value_of(view);
+        let flipped = !plant_opcua::patches::are_applied()
+            && before.stamp().status != view.stamp().status
+            && before.has_value_of(view);
         let between = flipped.then(|| view.between());
         let weight = view.weight();
         if weight <= SMALL {
@@ -571,11 +573,13 @@ impl SpaceNodes {
         let is_value = write.attribute_id == AttributeId::Value;
         let place = self.place(&write.node_id).filter(|_| is_value);
         let Some((topic, field)) = place else {
-            let exists = address_space.read().node_exists(&write.node_id);
-            return Err(if exists {
-                StatusCode::BadNotWritable
-            } else {
-                StatusCode::BadNodeIdUnknown
+            let address_space = address_space.read();
+            return Err(match address_space.find(&write.node_id) {
+                Some(node) if !has_attribute(node, write.attribute_id) => {
+                    StatusCode::BadAttributeIdInvalid
+                }
+                Some(_) => StatusCode::BadNotWritable,
+                None => StatusCode::BadNodeIdUnknown,
             });
         };
         if !topic.writable() {
@@ -859,9 +863,11 @@ fn new_fields(
     let current = |field| current(field).filter(|value| !matches!(value, Variant::Empty));
     let at = |field: &FieldNode| topic.fields.iter().position(|one| one.node == field.node);
     let value = if range.has_range() {
-        let place = field.and_then(at);
-        let mut whole =
-            current(place.filter(|_| topic.compound)).ok_or(StatusCode::BadIndexRangeNoData)?;
+        let whole = match field.and_then(at) {
+            None if topic.compound => None,
+            place => current(place.filter(|_| topic.compound)),
+        };
+        let mut whole = whole.ok_or(StatusCode::BadIndexRangeNoData)?;
         whole.set_range_of(range, value)?;
         whole
     } else {
@@ -910,6 +916,14 @@ fn members(value: Variant) -> Result<Vec<Variant>, StatusCode> {
             }
         })
         .collect())
+}
+
+fn has_attribute(node: &NodeType, attribute: AttributeId) -> bool {
+    let node = node.as_node();
+    let none = NumericRange::None;
+    let wanted = TimestampsToReturn::Neither;
+    node.get_attribute(wanted, attribute, &none, &DataEncoding::Binary)
+        .is_some()
 }
 
 /// Removes the timestamps that were not requested.
@@ -987,8 +1001,17 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
             let handle = item.handle();
             let queue = item.queue_size();
             let unfiltered = unfiltered(item);
-            self.watched.lock().insert(handle, unfiltered, queue);
             let node = item.item_to_monitor();
+            let exists = match address_space.find(&node.node_id) {
+                Some(node) if has_attribute(node, AttributeId::Value) => Ok(()),
+                Some(_) => Err(StatusCode::BadAttributeIdInvalid),
+                None => Err(StatusCode::BadNodeIdUnknown),
+            };
+            if let Err(status) = exists {
+                item.set_status(status);
+                continue;
+            }
+            self.watched.lock().insert(handle, unfiltered, queue);
             let value = match address_space.validate_node_read(context, node) {
                 Ok(_) => {
                     let answer = self.answer_item(&node.node_id, handle);
@@ -999,13 +1022,11 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
             let value = value.unwrap_or_else(|| {
                 address_space.read(context, node, 0.0, TimestampsToReturn::Both)
             });
-            if value.status() != StatusCode::BadAttributeIdInvalid {
-                item.set_initial_value(value);
-            }
+            item.set_initial_value(value);
             item.set_status(StatusCode::Good);
-            // Every change is reported on arrival, with its own time. The server would delay a
-            // value that arrives within the sampling interval, and change its source timestamp.
-            if item.sampling_interval() > 0.0 {
+            // The unpatched library changes the source timestamp of a value that arrives within the
+            // sampling interval, so that every change is reported on arrival.
+            if !plant_opcua::patches::are_applied() && item.sampling_interval() > 0.0 {
                 item.revise_sampling_interval(AS_IT_COMES_MS);
             }
             // A value that arrives between this read and the registration of the item is seen only
@@ -1173,7 +1194,7 @@ fn now() -> Instant {
 const NAME: &str = "space";
 /// Status of a written value while it is unknown if it has arrived.
 const UNCONFIRMED: StatusCode = StatusCode::UncertainLastUsableValue;
-/// A sampling interval that is practically zero, but above the 0 that the server treats as "not
+/// A sampling interval that is practically zero, but above the 0 that the library treats as "not
 /// requested".
 const AS_IT_COMES_MS: f64 = 0.000_1;
 /// Time limit for a write to be sent by the run loop.

@@ -272,10 +272,12 @@ pub(crate) fn compact(payload: Bytes) -> Bytes {
 
 /// Returns the first and last element of a one-dimensional range.
 fn bounds(range: &NumericRange) -> Option<(usize, usize)> {
-    let (first, last) = match range {
-        NumericRange::Index(at) => (*at, *at),
-        NumericRange::Range(first, last) => (*first, *last),
-        NumericRange::None | NumericRange::MultipleRanges(_) => return None,
+    let (first, last) = if let NumericRange::Index(at) = range {
+        (*at, *at)
+    } else if let NumericRange::Range(first, last) = range {
+        (*first, *last)
+    } else {
+        return None;
     };
     Some((usize::try_from(first).ok()?, usize::try_from(last).ok()?))
 }

@@ -12,8 +12,8 @@ use opcua::server::node_manager::{ParsedWriteValue, RequestContext, ServerContex
 use opcua::server::{CreateMonitoredItem, SubscriptionCache};
 use opcua::sync::RwLock;
 use opcua::types::{
-    Argument, AttributeId, DataValue, DateTime, NodeId, ObjectTypeId, ReferenceTypeId, StatusCode,
-    TimestampsToReturn, Variant,
+    Argument, AttributeId, DataEncoding, DataValue, DateTime, NodeId, NumericRange, ObjectTypeId,
+    ReferenceTypeId, StatusCode, TimestampsToReturn, Variant,
 };
 use tokio::time::{Instant, timeout_at};
 
@@ -180,6 +180,16 @@ impl Nodes {
         let node = address_space
             .find(&write.node_id)
             .ok_or(StatusCode::BadNodeIdUnknown)?;
+        let none = NumericRange::None;
+        let attribute = node.as_node().get_attribute(
+            TimestampsToReturn::Neither,
+            write.attribute_id,
+            &none,
+            &DataEncoding::Binary,
+        );
+        if attribute.is_none() {
+            return Err(StatusCode::BadAttributeIdInvalid);
+        }
         let NodeType::Variable(variable) = node else {
             return Err(StatusCode::BadNotWritable);
         };
