@@ -77,9 +77,11 @@ fn state(name: &str) -> (u32, &'static str) {
     }
 }
 
+mod configuration;
 mod faults;
 mod foreign;
 mod robot;
+mod values;
 
 #[test]
 fn a_client_with_a_queue_sees_each_state_of_runs_that_are_over_at_once() {

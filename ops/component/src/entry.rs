@@ -11,6 +11,7 @@ use bridge_node::{
 };
 use mappings::{Mapping, SpaceId};
 use plant_opcua::enrolment::GdsArguments;
+use skills::yaml::Code;
 use skills::{Component, Lds, Security};
 
 use crate::{ComponentPort, Options, made, simulate};
@@ -27,12 +28,24 @@ struct UaComponent {
     #[arg(
         value_name = "COMPONENT",
         env = "UA_COMPONENT",
-        required_unless_present = "nodeset"
+        required_unless_present_any = ["nodeset", "schema", "explain"]
     )]
     component: Option<PathBuf>,
     /// Print the NodeSet with the skill types, and exit
     #[arg(long)]
     nodeset: bool,
+    /// Print a JSON schema, and exit: of the YAML, or of the lines of `exec` programs
+    #[arg(
+        long,
+        value_name = "OF",
+        value_enum,
+        num_args = 0..=1,
+        default_missing_value = "component"
+    )]
+    schema: Option<Schema>,
+    /// Print the meaning of a finding's code, or of all codes, and exit
+    #[arg(long, value_name = "CODE", num_args = 0..=1, default_missing_value = "all")]
+    explain: Option<String>,
     /// Check the YAML and the types it names, print every finding, and exit
     #[arg(long)]
     check: bool,
@@ -65,6 +78,13 @@ struct UaComponent {
     arguments: WithoutMapping,
     #[arg(skip)]
     read: OnceLock<Read>,
+}
+
+/// The schemas that the program prints.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum Schema {
+    Component,
+    Exec,
 }
 
 /// The YAML file that was read.
@@ -141,8 +161,26 @@ impl UaComponent {
             mdns: Some(mdns),
             capabilities: vec!["DA".to_owned()],
             gds: None,
+            configuration: Some(self.pki_root(read).join("configuration.json")),
             source: Some((read.text.clone(), self.file().display().to_string())),
         }
+    }
+}
+
+/// Returns the meaning of a code, or of all codes.
+fn explained(wanted: &str) -> Result<String, Failure> {
+    let all = wanted == "all";
+    let codes = Code::ALL.iter();
+    let told: String = codes
+        .filter(|code| all || code.as_str().eq_ignore_ascii_case(wanted))
+        .map(|code| format!("{code}: {}\n", code.explanation()))
+        .collect();
+    match told.is_empty() {
+        true => Err(Failure::new(
+            FailureKind::Usage,
+            format!("unknown code `{wanted}`; `--explain` alone prints all codes"),
+        )),
+        false => Ok(told),
     }
 }
 
@@ -163,9 +201,15 @@ impl Program for UaComponent {
     }
 
     fn made(&self) -> Result<Option<Made>, Failure> {
-        if self.nodeset {
-            let mut out = std::io::stdout().lock();
-            let printed = out.write_all(skills::model::nodeset().as_bytes());
+        let text = match (self.nodeset, self.schema, &self.explain) {
+            (true, ..) => Some(skills::model::nodeset()),
+            (_, Some(Schema::Component), _) => Some(Component::SCHEMA.to_owned()),
+            (_, Some(Schema::Exec), _) => Some(crate::exec::SCHEMA.to_owned()),
+            (_, _, Some(code)) => Some(explained(code)?),
+            (false, None, None) => None,
+        };
+        if let Some(text) = text {
+            let printed = std::io::stdout().lock().write_all(text.as_bytes());
             printed.map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
             return Ok(Some(Made::Checked));
         }

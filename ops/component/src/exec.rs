@@ -5,6 +5,7 @@
 //! group. Then the state of its machine is unknown: the `stop` command runs, and the skill
 //! needs a Reset.
 
+use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
@@ -19,8 +20,14 @@ use tokio::process::{Child, ChildStdin, Command};
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{info, warn};
 
-/// Replaces the description of programs by drivers that run them.
+mod sensor;
+
+/// The JSON schema of the lines of programs.
+pub(crate) const SCHEMA: &str = include_str!("exec/lines.schema.json");
+
+/// Replaces the description of programs by drivers and sensors that run them.
 pub(crate) fn with_programs(mut component: Component) -> Component {
+    sensor::with_sensors(&mut component);
     for skill in &mut component.skills {
         if let DriverSetup::Exec(work) = &skill.driver {
             let driver = Program {
@@ -56,11 +63,8 @@ impl Driver for Program {
     }
 
     async fn run(&self, work: Work) -> Result<Results, String> {
-        let mut child = self.start(&self.work.command, Stdio::piped)?;
-        let group = child
-            .id()
-            .and_then(|id| i32::try_from(id).ok())
-            .and_then(Pid::from_raw);
+        let mut child = start(&self.work.command, &self.work.folder, [Stdio::piped; 2])?;
+        let group = group_of(&child);
         let _group = KilledGroup(group);
         let ended = self.follow(&mut child, &work).await;
         match ended {
@@ -81,25 +85,6 @@ impl Driver for Program {
 }
 
 impl Program {
-    /// Starts a command without the environment of this program, which may contain secrets.
-    fn start(&self, command: &[String], stream: fn() -> Stdio) -> Result<Child, String> {
-        let (program, arguments) = command.split_first().ok_or("no program is named")?;
-        let kept = KEPT_VARIABLES.iter();
-        let kept = kept.filter_map(|name| Some((*name, std::env::var_os(name)?)));
-        let started = Command::new(program)
-            .args(arguments)
-            .current_dir(&self.work.folder)
-            .env_clear()
-            .envs(kept)
-            .stdin(stream())
-            .stdout(stream())
-            .stderr(stream())
-            .process_group(0)
-            .kill_on_drop(true)
-            .spawn();
-        started.map_err(|error| format!("cannot start {program}: {error}"))
-    }
-
     /// Follows a run to its end.
     async fn follow(&self, child: &mut Child, work: &Work) -> Ended {
         let unknown = |why: &str| Ended::Unknown(format!("{}: {why}", self.name()));
@@ -119,8 +104,12 @@ impl Program {
         let parameters: serde_json::Map<String, Json> = parameters
             .map(|(name, value)| (name.clone(), value.to_json()))
             .collect();
-        let start =
+        let mut start =
             json!({"start": {"skill": self.skill, "run": work.run(), "parameters": parameters}});
+        let configured = work.configuration().iter();
+        for (name, value) in configured {
+            start["start"]["configuration"][name] = value.to_json();
+        }
         // A program that reads nothing may have written its result and ended.
         let deaf = send(&mut input, &start).await.err();
         let mut until = deaf.as_ref().map(|_| Instant::now() + SENT_WITHIN);
@@ -175,15 +164,11 @@ impl Program {
         let Some(command) = &self.work.stop else {
             return "there is no `stop` command".to_owned();
         };
-        let mut child = match self.start(command, Stdio::null) {
+        let mut child = match start(command, &self.work.folder, [Stdio::null; 2]) {
             Ok(child) => child,
             Err(why) => return format!("the `stop` command has failed: {why}"),
         };
-        let group = child
-            .id()
-            .and_then(|id| i32::try_from(id).ok())
-            .and_then(Pid::from_raw);
-        let _group = KilledGroup(group);
+        let _group = KilledGroup(group_of(&child));
         match timeout(STOP_WITHIN, child.wait()).await {
             Ok(Ok(status)) if status.success() => "the `stop` command is done".to_owned(),
             Ok(Ok(status)) => format!("the `stop` command has failed: {status}"),
@@ -195,6 +180,36 @@ impl Program {
     fn name(&self) -> &str {
         self.work.command.first().map_or("", String::as_str)
     }
+}
+
+/// Starts a command without the environment of this program, which may contain secrets. The
+/// streams are the input, and the output with the errors.
+fn start(
+    command: &[String],
+    folder: &Path,
+    [input, output]: [fn() -> Stdio; 2],
+) -> Result<Child, String> {
+    let (program, arguments) = command.split_first().ok_or("no program is named")?;
+    let kept = KEPT_VARIABLES.iter();
+    let kept = kept.filter_map(|name| Some((*name, std::env::var_os(name)?)));
+    let started = Command::new(program)
+        .args(arguments)
+        .current_dir(folder)
+        .env_clear()
+        .envs(kept)
+        .stdin(input())
+        .stdout(output())
+        .stderr(output())
+        .process_group(0)
+        .kill_on_drop(true)
+        .spawn();
+    started.map_err(|error| format!("cannot start {program}: {error}"))
+}
+
+/// Returns the process group that a program leads.
+fn group_of(child: &Child) -> Option<Pid> {
+    let id = child.id().and_then(|id| i32::try_from(id).ok());
+    id.and_then(Pid::from_raw)
 }
 
 /// Kills a process group when it is dropped, so that no descendant outlives its run.
@@ -302,15 +317,17 @@ enum Report {
     Ended(Result<Results, String>),
 }
 
+/// The keys of a line of a program.
+const KEYS: [&str; 5] = ["progress", "step", "note", "result", "failed"];
+
 fn reported(text: &str) -> Result<Report, String> {
     let shown: String = text.chars().take(80).collect();
     let wrong = |why: &str| format!("its line `{shown}` {why}");
     let Ok(Json::Object(line)) = serde_json::from_str(text) else {
         return Err(wrong("is not a JSON object"));
     };
-    let known = ["progress", "step", "note", "result", "failed"];
-    if let Some(other) = line.keys().find(|key| !known.contains(&key.as_str())) {
-        let known = known.join(", ");
+    if let Some(other) = line.keys().find(|key| !KEYS.contains(&key.as_str())) {
+        let known = KEYS.join(", ");
         return Err(wrong(&format!("has the key `{other}`; known are {known}")));
     }
     let text_of = |key: &str| match line.get(key) {
@@ -324,7 +341,7 @@ fn reported(text: &str) -> Result<Report, String> {
     match line.get("result") {
         Some(Json::Object(results)) => {
             let results = results.iter().map(|(name, value)| {
-                let value = value_of(value);
+                let value = Value::of_json(value);
                 let value = value
                     .ok_or_else(|| wrong(&format!("has a result `{name}` of a wrong type")))?;
                 Ok((name.clone(), value))
@@ -349,20 +366,6 @@ fn reported(text: &str) -> Result<Report, String> {
         step: text_of("step")?,
         note: text_of("note")?,
     })
-}
-
-/// Converts a result; the skill converts numbers to the declared type.
-fn value_of(json: &Json) -> Option<Value> {
-    match json {
-        Json::Bool(value) => Some(Value::from(*value)),
-        Json::Number(number) => number.as_f64().map(Value::from),
-        Json::String(text) => Some(Value::from(text.as_str())),
-        Json::Array(elements) => {
-            let numbers: Option<Vec<f64>> = elements.iter().map(Json::as_f64).collect();
-            numbers.map(Value::from)
-        }
-        Json::Null | Json::Object(_) => None,
-    }
 }
 
 /// The environment variables that a program keeps.

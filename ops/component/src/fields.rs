@@ -19,6 +19,13 @@ pub(crate) fn block(values: &[Value]) -> Vec<u8> {
     out
 }
 
+/// Encodes a block without a value: its StatusCode instead.
+pub(crate) fn no_value(status: u32) -> Vec<u8> {
+    let mut out = vec![1, 0, BuiltinType::StatusCode.id()];
+    out.extend(status.to_le_bytes());
+    out
+}
+
 /// Decodes the values of a block; `None` for a null value.
 ///
 /// # Errors

@@ -19,6 +19,7 @@ mod port;
 #[cfg(feature = "devices")]
 mod simulate;
 mod space;
+mod topics;
 mod work;
 
 pub use mirrors::{Foreign, ForeignFaults, ForeignSkills};

@@ -9,7 +9,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use bridge_node::actions::OwnActions;
 use bridge_node::{
     Answered, Application, AskId, CallDescription, Delivery, Described, Executed, Execution,
-    ExecutionId, Failure, FailureKind, Port, PortEvent, TypePaths,
+    ExecutionId, Failure, FailureKind, LinkState, Port, PortEvent, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, Interface};
@@ -20,7 +20,7 @@ use plant_opcua::own;
 use plant_opcua::supervision::Supervision;
 use program::{Method, State};
 use skills::server::{ComponentServer, PowerOff, ServeFault, ServeSettings};
-use skills::{Component, Owner, PeerAccess, Security, Skill};
+use skills::{Component, LiveValue, Owner, PeerAccess, Security, Skill, ValueSource};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tracing::{info, warn};
@@ -32,6 +32,7 @@ use crate::fields;
 use crate::goals::{self, Doer, Reporter};
 use crate::partners;
 use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
+use crate::topics::Topics;
 use crate::work::with_drivers;
 
 /// The options of a component beside its definition.
@@ -47,6 +48,9 @@ pub struct Options {
     pub capabilities: Vec<String>,
     /// The Global Discovery Server that issues the certificate. Needs `pki`.
     pub gds: Option<Invitation>,
+    /// The file with the configuration of the component; `None` for a configuration that is lost
+    /// at the end of the program.
+    pub configuration: Option<PathBuf>,
     /// The text and the name of the YAML file, for findings.
     pub source: Option<(String, String)>,
 }
@@ -73,6 +77,10 @@ pub struct ComponentPort {
     _looks: JoinSet<()>,
     /// Requests of skills to others.
     asking: Asking,
+    /// The topics that values of the component are received from.
+    topics: Topics,
+    /// The values with sources outside of the component.
+    measured: Vec<LiveValue>,
     /// The application as it is described to the group.
     application: Application,
     /// The skills that are being halted because the component stops.
@@ -104,10 +112,12 @@ impl ComponentPort {
             first_run: run_number_of_now(),
             supervision: Supervision::default(),
             power_off: component.power_off.then(power_off),
+            configuration: options.configuration.clone(),
         };
         let mut reporters = Vec::new();
         let mut asking = Asking::new();
-        let component = &with_drivers(component, &mut asking);
+        let mut topics = Topics::default();
+        let component = &with_drivers(component, &mut asking, &mut topics);
         let server = ComponentServer::build(component, &settings, |number, facts| {
             let reporter = Reporter::new();
             reporters.push(reporter.clone());
@@ -128,6 +138,8 @@ impl ComponentPort {
                 first.extend(added.unwrap_or_default());
             }
         }
+        let measured = show_values(component, &server, (&place, &outbox), &mut looks);
+        first.extend(announced_values(&server, &place));
         server.start();
         let told = told_of(component, server.url(), options);
         let application = application(&told, &component.security);
@@ -140,6 +152,7 @@ impl ComponentPort {
         }
         info!(
             skills = server.skills().len(),
+            values = server.values().len(),
             namespace = component.namespace,
             "{} is served at {}",
             component.name,
@@ -156,6 +169,8 @@ impl ComponentPort {
             actions,
             _looks: looks,
             asking,
+            topics,
+            measured,
             application,
             closing: Arc::default(),
             pki: options.pki.clone(),
@@ -206,8 +221,9 @@ impl Port for ComponentPort {
         Some(self.application.clone())
     }
 
-    /// Ignores values of others. A component does not use them, so they do not count as losses.
-    fn publish(&mut self, _sample: Delivery) -> Result<(), &'static str> {
+    /// Takes the values that the component shows. Other values do not count as losses.
+    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+        self.topics.received(&sample);
         Ok(())
     }
 
@@ -217,10 +233,33 @@ impl Port for ComponentPort {
         _shape: &[(BuiltinType, bool)],
         _described: Option<&Described>,
     ) {
-        // A component does not use values of others.
+        // Values of others have no type here: they are fields.
     }
 
-    fn silent(&mut self, _topic: TopicId, _silent: bool) {}
+    fn silent(&mut self, topic: TopicId, silent: bool) {
+        self.topics.set_silent(topic, silent);
+    }
+
+    /// Returns the sources of values, with the reasons of unknown values.
+    fn links(&self) -> Vec<LinkState> {
+        if self.measured.is_empty() {
+            return Vec::new();
+        }
+        let faults: BTreeMap<String, String> = self
+            .measured
+            .iter()
+            .filter_map(|value| Some((value.facts().name.clone(), value.reading().value.err()?)))
+            .collect();
+        vec![LinkState {
+            name: "values".to_owned(),
+            up: faults.is_empty(),
+            why: faults
+                .first_key_value()
+                .map(|(name, why)| format!("{name}: {why}")),
+            faults,
+            ..LinkState::default()
+        }]
+    }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.asking.known(topic, description);
@@ -330,7 +369,7 @@ pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
     let component = Component {
         endpoint: "opc.tcp://127.0.0.1:0".to_owned(),
         security: vec![Security::None],
-        ..with_drivers(component, &mut Asking::new())
+        ..with_drivers(component, &mut Asking::new(), &mut Topics::default())
     };
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -405,6 +444,30 @@ fn told_of(component: &Component, url: &str, options: &Options) -> discovery::Se
         capabilities: options.capabilities.clone(),
         number: NonZeroU16::new(component.namespace),
     }
+}
+
+/// Returns the announcements of the values.
+fn announced_values(server: &ComponentServer, place: &Place) -> Vec<PortEvent> {
+    let values = (1..).zip(server.values());
+    let announced = values.flat_map(|(number, value)| place.announce_value(number, value.facts()));
+    announced.collect()
+}
+
+/// Publishes the values in the space. Returns the values with sources outside of the component.
+fn show_values(
+    component: &Component,
+    server: &ComponentServer,
+    (place, outbox): (&Place, &Outbox),
+    tasks: &mut JoinSet<()>,
+) -> Vec<LiveValue> {
+    for (number, value) in (1..).zip(server.values()) {
+        if let Some(topic) = place.value(number) {
+            tasks.spawn(outbox.clone().publish(topic, value.clone()));
+        }
+    }
+    let measured = component.values.iter().zip(server.values());
+    let measured = measured.filter(|(setup, _)| !matches!(setup.source, ValueSource::Computed(..)));
+    measured.map(|(_, value)| value.clone()).collect()
 }
 
 /// Ends the program after a delay.

@@ -64,6 +64,9 @@ enum Device {
         /// host:port of the secondary interface
         #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:30002")]
         secondary: String,
+        /// The height of a surface that pushes the tool back, m
+        #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
+        surface: Option<f64>,
         #[command(flatten)]
         pace: Pace,
     },
@@ -278,10 +281,12 @@ async fn simulated(device: Device) -> io::Result<()> {
         Device::Robot {
             rtde,
             secondary,
+            surface,
             pace,
         } => {
             let settings = ur::simulator::Settings {
                 time_scale: pace.speed,
+                surface,
                 ..ur::simulator::Settings::default()
             };
             let simulator = ur::simulator::Simulator::new(settings);

@@ -1,5 +1,5 @@
 //! The skills of a component as values and calls of the space. Skill k has the identifiers `100*k +
-//! n`.
+//! n`, value v has the identifier `10 + v`.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU16;
@@ -12,8 +12,10 @@ use bytes::Bytes;
 use mappings::{Overflow, TopicId};
 use messages::{Leaf, Rank, TypeName};
 use program::{Method, State};
+use skills::server::value_status;
 use skills::{
-    Builtin, Facts, Observer, Outcome, Parameter, Parameters, Shown, Told, Transitioned, Value,
+    Builtin, Facts, LiveValue, Observer, Outcome, Parameter, Parameters, Shown, Told, Transitioned,
+    Value, ValueFacts,
 };
 use tokio::sync::Notify;
 use tokio::time::Instant;
@@ -95,6 +97,36 @@ impl Place {
             }
         }
         events
+    }
+
+    /// Returns the topic of value `number` of the component.
+    pub(crate) fn value(&self, number: u16) -> Option<TopicId> {
+        let identifier = FIRST_VALUE.checked_add(number)?;
+        let fits = identifier < PER_SKILL;
+        fits.then(|| TopicId::new(0, self.namespace, identifier))?
+    }
+
+    /// Returns the announcement of a value.
+    pub(crate) fn announce_value(&self, number: u16, facts: &ValueFacts) -> Vec<PortEvent> {
+        let Some(topic) = self.value(number) else {
+            return Vec::new();
+        };
+        let message = (!facts.shape.array).then(|| std_message(facts.shape.builtin));
+        let description = ValueDescription {
+            name: format!("{}.{}", self.component, facts.name),
+            message_type: message.and_then(|name| TypeName::new("std_msgs", name).ok()),
+            about: about_value(facts),
+            fields: vec![Leaf {
+                path: "data".to_owned(),
+                builtin: fields::builtin(facts.shape.builtin),
+                rank: fields::rank(facts.shape),
+            }],
+            overflow: Overflow::KeepLatest,
+        };
+        vec![
+            PortEvent::Described { topic, description },
+            PortEvent::Live { topic, live: true },
+        ]
     }
 
     fn values(&self, facts: &Facts) -> [(u16, ValueDescription); 4] {
@@ -215,6 +247,42 @@ impl Place {
     }
 }
 
+/// Returns the message of std_msgs with a value of this type.
+const fn std_message(builtin: Builtin) -> &'static str {
+    match builtin {
+        Builtin::Boolean => "Bool",
+        Builtin::SByte => "Int8",
+        Builtin::Byte => "UInt8",
+        Builtin::Int16 => "Int16",
+        Builtin::UInt16 => "UInt16",
+        Builtin::Int32 => "Int32",
+        Builtin::UInt32 => "UInt32",
+        Builtin::Int64 => "Int64",
+        Builtin::UInt64 => "UInt64",
+        Builtin::Float => "Float32",
+        Builtin::Double => "Float64",
+        Builtin::String => "String",
+    }
+}
+
+/// Returns the description of a value with its unit and range.
+fn about_value(facts: &ValueFacts) -> String {
+    let unit = facts.unit.as_deref().unwrap_or_default();
+    let range = facts.range.map(|(low, high)| format!("{low} to {high}"));
+    let numbers = match (range, unit) {
+        (None, "") => String::new(),
+        (None, unit) => format!("[{unit}]"),
+        (Some(range), "") => format!("[{range}]"),
+        (Some(range), unit) => format!("[{range} {unit}]"),
+    };
+    let about = [facts.about.as_str(), &numbers];
+    about
+        .into_iter()
+        .filter(|text| !text.is_empty())
+        .collect::<Vec<_>>()
+        .join(" ")
+}
+
 /// Returns the meaning of a parameter for users.
 fn note(parameter: &Parameter) -> FieldNote {
     let default = parameter.default.as_ref().map(ToString::to_string);
@@ -256,6 +324,8 @@ struct Sample {
     at: Timestamp,
     /// True if a newer value of the topic may replace this value.
     passing: bool,
+    /// The upper 16 bits of the StatusCode; 0 for Good.
+    status: u16,
 }
 
 impl Outbox {
@@ -281,8 +351,20 @@ impl Outbox {
             });
         }
         let Sample {
-            topic, payload, at, ..
+            topic,
+            payload,
+            at,
+            status,
+            ..
         } = waiting.samples.pop_front()?;
+        if status != 0 {
+            return Some(PortEvent::Qualified {
+                topic,
+                payload,
+                taken: at,
+                status,
+            });
+        }
         Some(PortEvent::Sample {
             topic,
             payload,
@@ -291,14 +373,41 @@ impl Outbox {
         })
     }
 
+    /// Publishes a value at each change. The newest value replaces a value that still waits.
+    pub(crate) async fn publish(self, topic: TopicId, value: LiveValue) {
+        let mut readings = value.watch();
+        loop {
+            let reading = readings.borrow_and_update().clone();
+            let status = value_status(value.facts(), &reading).bits();
+            let payload = match &reading.value {
+                Ok(value) => fields::block(std::slice::from_ref(value)),
+                Err(_) => fields::no_value(status),
+            };
+            self.push(Sample {
+                topic,
+                payload: Bytes::from(payload),
+                at: now().utc,
+                passing: true,
+                status: u16::try_from(status >> 16).unwrap_or(u16::MAX),
+            });
+            if readings.changed().await.is_err() {
+                return;
+            }
+        }
+    }
+
     fn put(&self, topic: TopicId, values: &[Value], passing: bool) {
-        let payload = Bytes::from(fields::block(values));
-        let sample = Sample {
+        self.push(Sample {
             topic,
-            payload,
+            payload: Bytes::from(fields::block(values)),
             at: now().utc,
             passing,
-        };
+            status: 0,
+        });
+    }
+
+    fn push(&self, sample: Sample) {
+        let Sample { topic, passing, .. } = sample;
         let mut waiting = self.lock();
         if passing
             && waiting
@@ -487,6 +596,8 @@ fn named(of: &[(String, Value)]) -> [Value; 2] {
 
 /// Largest number of skills. Identifiers have 16 bits, and a skill has a hundred of them.
 pub(crate) const MOST_IN_SPACE: usize = 654;
+/// The identifier of value n is larger by n; values have the identifiers below those of skills.
+const FIRST_VALUE: u16 = 10;
 /// Number of identifiers of a skill.
 const PER_SKILL: u16 = 100;
 /// The length in bytes of a default value above which it is not announced.

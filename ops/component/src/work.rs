@@ -22,10 +22,17 @@ use uadp::{BuiltinType, Fields};
 use crate::asking::{Asking, Asks};
 use crate::definition::field_name;
 use crate::fields;
+use crate::topics::Topics;
 
-/// Returns the component with drivers for the skills that other participants of the space execute.
-pub(crate) fn with_drivers(component: &Component, asking: &mut Asking) -> Component {
+/// Returns the component with drivers for the skills that other participants of the space execute,
+/// and with sensors for the values that they publish.
+pub(crate) fn with_drivers(
+    component: &Component,
+    asking: &mut Asking,
+    topics: &mut Topics,
+) -> Component {
     let mut component = crate::exec::with_programs(component.clone());
+    topics.add_sensors(&mut component);
     for skill in &mut component.skills {
         if let DriverSetup::Space(work) = &skill.driver
             && let Ok(topic) = work.topic.parse()
@@ -812,7 +819,7 @@ mod tests {
         for name in ["niryo-ned.yaml", "turtlebot3.yaml"] {
             let component = example(name);
             let mut asking = Asking::new();
-            let made = with_drivers(&component, &mut asking);
+            let made = with_drivers(&component, &mut asking, &mut Topics::default());
             let given = |skill: &skills::SkillSetup| matches!(skill.driver, DriverSetup::Given(_));
             assert!(made.skills.iter().all(given), "{name}");
         }

@@ -308,6 +308,7 @@ impl UaMes {
             mdns: Some(self.interface()),
             capabilities: vec!["DA".to_owned()],
             gds: None,
+            configuration: None,
             source: None,
         }
     }
@@ -461,6 +462,8 @@ fn component(settings: &Settings, driver: ExecuteProcess, locator: LocateObject)
         robot: None,
         power_off: false,
         world: Arc::default(),
+        values: Vec::new(),
+        configurable: Vec::new(),
         skills: vec![
             skill("ExecuteProcess", Arc::new(driver)),
             skill("LocateObject", Arc::new(locator)),

@@ -6,7 +6,7 @@ mod live;
 mod recording;
 mod write;
 
-pub(crate) use cell::{Doctor, New, StatusArguments, Template};
+pub(crate) use cell::{Doctor, DriverTemplate, New, StatusArguments, Template};
 pub(crate) use discover::{Discover, Look};
 pub(crate) use live::{
     Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, Skills, SkillsVerb, Source,

@@ -3,13 +3,19 @@
 use std::fs::OpenOptions;
 use std::io::{self, Write as _};
 
-use crate::arguments::{New, Template};
+use crate::arguments::{DriverTemplate, New, Template};
 use crate::exit::Failure;
 use crate::report::warn;
 
 /// Runs `ua-space new`. An existing file stays unchanged.
 pub(crate) fn new(arguments: &New) -> Result<(), Failure> {
-    let text = text(arguments.template);
+    let (template, driver) = (arguments.template, arguments.driver);
+    if template != Template::Component && driver != DriverTemplate::Simulated {
+        return Err(Failure::Usage(
+            "only a component has a driver: ua-space new component --driver ...".to_owned(),
+        ));
+    }
+    let text = text(template, driver);
     let Some(path) = &arguments.output else {
         io::stdout().lock().write_all(text.as_bytes())?;
         return Ok(());
@@ -34,34 +40,49 @@ pub(crate) fn new(arguments: &New) -> Result<(), Failure> {
     Ok(())
 }
 
-const fn text(template: Template) -> &'static str {
-    match template {
-        Template::Component => include_str!("new/component.yaml"),
-        Template::Mes => include_str!("new/mes.yaml"),
-        Template::Mapping => include_str!("new/mapping.yaml"),
+const fn text(template: Template, driver: DriverTemplate) -> &'static str {
+    match (template, driver) {
+        (Template::Component, DriverTemplate::Simulated) => include_str!("new/component.yaml"),
+        (Template::Component, DriverTemplate::Ros) => include_str!("new/component-ros.yaml"),
+        (Template::Component, DriverTemplate::Exec) => include_str!("new/component-exec.yaml"),
+        (Template::Component, DriverTemplate::Http) => include_str!("new/component-http.yaml"),
+        (Template::Mes, _) => include_str!("new/mes.yaml"),
+        (Template::Mapping, _) => include_str!("new/mapping.yaml"),
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use clap::ValueEnum as _;
+
     use super::*;
 
     #[test]
     fn the_starting_mapping_runs_without_findings() {
-        let checked = mappings::Mapping::from_yaml(text(Template::Mapping), "mapping.yaml");
+        let checked = mappings::Mapping::from_yaml(
+            text(Template::Mapping, DriverTemplate::Simulated),
+            "mapping.yaml",
+        );
         assert!(checked.mapping.is_some(), "{:?}", checked.findings);
         assert!(checked.findings.is_empty(), "{:?}", checked.findings);
     }
 
     #[test]
     fn starting_files_explain_each_key() {
-        for template in [Template::Component, Template::Mes, Template::Mapping] {
-            let lines: Vec<&str> = text(template).lines().collect();
+        let component = DriverTemplate::value_variants().iter();
+        let component = component.map(|driver| (Template::Component, *driver));
+        let others = [Template::Mes, Template::Mapping];
+        let others = others.map(|template| (template, DriverTemplate::Simulated));
+        for (template, driver) in component.chain(others) {
+            let lines: Vec<&str> = text(template, driver).lines().collect();
             let comments = lines
                 .iter()
                 .filter(|line| line.trim_start().starts_with('#'));
-            assert!(comments.count() * 3 > lines.len(), "{template:?}");
-            assert!(lines.iter().all(|line| line.len() <= 100), "{template:?}");
+            assert!(
+                comments.count() * 3 > lines.len(),
+                "{template:?} {driver:?}"
+            );
+            assert!(lines.iter().all(|line| line.len() <= 100), "{driver:?}");
         }
     }
 }

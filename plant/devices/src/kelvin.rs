@@ -15,8 +15,9 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    COMPOSITE_HALT_TIMEOUT, Device, Driver, DriverFault, Parameters, PartEnd, Partner, PeerAccess,
-    Results, Runs, SkillClient, SkillFault, ToolState, TypeName, Value, Work, run_part,
+    Builtin, COMPOSITE_HALT_TIMEOUT, Device, DeviceValue, Driver, DriverFault, Measured,
+    Parameters, PartEnd, Partner, PeerAccess, Results, Runs, SkillClient, SkillFault, ToolState,
+    TypeName, Value, Work, run_part,
 };
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
@@ -24,6 +25,7 @@ use tokio::time::{Instant, sleep, timeout};
 pub use self::volts::{Detector, LEVELS, Reading, volts};
 use crate::line::Line;
 use crate::modbus::Modbus;
+use crate::sensors::{ticks, value};
 
 /// The installation of the changer.
 #[derive(Debug, Clone, PartialEq)]
@@ -117,7 +119,7 @@ impl Changer {
     pub fn new(settings: Settings, mover: Mover) -> Self {
         let Converter { at, unit, .. } = &settings.converter;
         Self {
-            converter: Arc::new(Modbus::new(at.clone(), *unit)),
+            converter: Modbus::shared(at, *unit),
             shown: Arc::new(watch::channel(shown_at_first(&settings, &mover)).0),
             docks: Arc::default(),
             settings: Arc::new(settings),
@@ -208,6 +210,33 @@ impl Device for Changer {
 
     fn tool_changer(&self) -> Option<watch::Receiver<ToolState>> {
         Some(self.shown.subscribe())
+    }
+
+    fn values(&self) -> &'static [DeviceValue] {
+        &VALUES
+    }
+
+    async fn measure(&self, period: Duration, out: &Measured) -> String {
+        let mut ticks = ticks(period);
+        let mut look = Look {
+            changer: self,
+            detector: Detector::default(),
+        };
+        loop {
+            ticks.tick().await;
+            let volts = match look.volts().await {
+                Ok(volts) => volts,
+                Err(why) => return why,
+            };
+            out.put("Voltage", Ok(volts.into()));
+            let number = match look.detector.feed(volts) {
+                Ok(Reading::Ready | Reading::NoTool) => Ok(Value::Byte(0)),
+                Ok(Reading::Tool(number)) => Ok(Value::Byte(number)),
+                Ok(between @ Reading::Intermediate) => Err(between.to_string()),
+                Err(why) => Err(why),
+            };
+            out.put("ToolNumber", number);
+        }
     }
 
     async fn tend(&self, peers: &PeerAccess) {
@@ -555,6 +584,12 @@ struct Look<'c> {
 
 impl Look<'_> {
     async fn once(&mut self) -> Result<Reading, String> {
+        let volts = self.volts().await?;
+        self.detector.feed(volts)
+    }
+
+    /// Returns the voltage at the changer.
+    async fn volts(&self) -> Result<f64, String> {
         let Converter {
             register,
             divider: (line, ground),
@@ -562,8 +597,7 @@ impl Look<'_> {
         } = self.changer.settings.converter;
         let words = self.changer.converter.input(register, 1).await?;
         let millivolts = words.first().copied().unwrap_or_default();
-        self.detector
-            .feed(f64::from(millivolts) / 1000.0 * (line + ground) / ground)
+        Ok(f64::from(millivolts) / 1000.0 * (line + ground) / ground)
     }
 
     /// Returns the reading of two equal consecutive measurements.
@@ -689,6 +723,20 @@ impl Connected {
         }
     }
 }
+
+/// The values of a changer.
+const VALUES: [DeviceValue; 2] = [
+    DeviceValue {
+        unit: Some("V"),
+        range: Some((0.0, 15.0)),
+        ..value("Voltage", Builtin::Double, "The voltage at the changer.")
+    },
+    value(
+        "ToolNumber",
+        Builtin::Byte,
+        "The number of the attached tool; 0 for none.",
+    ),
+];
 
 /// Offsets for moving into and out of a dock, in m.
 const BACK: f64 = 0.045;

@@ -4,10 +4,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use skills::yaml::{Code, Node, Reader};
-use skills::{Device, DeviceKinds};
+use skills::{Device, DeviceKinds, Driver, SensorRead};
 
 use crate::line::Line;
-use crate::{kelvin, robotiq, schmalz, ur};
+use crate::{http_skill, kelvin, robotiq, schmalz, sensors, ur};
 
 /// The devices of this crate.
 #[derive(Debug, Clone, Copy, Default)]
@@ -25,6 +25,14 @@ impl DeviceKinds for Kinds {
                 reader.refuse(node, Code::Driver, message)
             }
         }
+    }
+
+    fn http(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Driver>> {
+        http_skill::read(node, reader)
+    }
+
+    fn sensor(&self, kind: &str, node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+        sensors::read(kind, node, reader)
     }
 }
 
@@ -63,7 +71,7 @@ fn read_schmalz(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>
 }
 
 /// Reads the name of a device as it is used in a path.
-fn read_alias<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
+pub(crate) fn read_alias<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
     let text = reader.text(node, "the alias of a device")?;
     let fits = !text.is_empty()
         && text.len() <= 64
@@ -78,7 +86,7 @@ fn read_alias<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
 }
 
 /// Reads `host:port`.
-fn read_address<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
+pub(crate) fn read_address<'n>(node: &'n Node, reader: &mut Reader<'_>) -> Option<&'n str> {
     let text = reader.text(node, "host:port")?;
     if format!("tcp://{text}").parse::<Line>().is_ok() {
         return Some(text);
@@ -150,7 +158,7 @@ fn read_changer(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>
     Some(Arc::new(kelvin::Changer::new(settings, mover)))
 }
 
-fn read_register(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
+pub(crate) fn read_register(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
     let text = reader.text(node, "the number of a register")?;
     let register = text.parse().ok();
     register.or_else(|| {
@@ -245,7 +253,7 @@ fn read_port(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
     })
 }
 
-fn read_line(node: &Node, reader: &mut Reader<'_>) -> Option<Line> {
+pub(crate) fn read_line(node: &Node, reader: &mut Reader<'_>) -> Option<Line> {
     let text = reader.text(node, "where the device is")?;
     match text.parse() {
         Ok(line) => Some(line),
@@ -253,7 +261,7 @@ fn read_line(node: &Node, reader: &mut Reader<'_>) -> Option<Line> {
     }
 }
 
-fn read_unit(node: &Node, reader: &mut Reader<'_>) -> Option<u8> {
+pub(crate) fn read_unit(node: &Node, reader: &mut Reader<'_>) -> Option<u8> {
     let text = reader.text(node, "the number of a unit")?;
     let unit = text.parse().ok().filter(|unit| (1..=247).contains(unit));
     unit.or_else(|| {

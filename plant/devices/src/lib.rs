@@ -5,16 +5,19 @@
 //! their software with it (`ua-component simulate`).
 //!
 //! Reading order: [`line`](Line) (the address of a device), `modbus` (the client), [`robotiq`],
-//! [`schmalz`], [`ur`], [`kelvin`] (which moves a robot).
+//! [`schmalz`], [`ur`], [`kelvin`] (which moves a robot), `sensors` (values without skills).
 
 #[cfg(test)]
 mod contact_tests;
+mod http;
+mod http_skill;
 pub mod kelvin;
 mod kinds;
 mod line;
 mod modbus;
 pub mod robotiq;
 pub mod schmalz;
+mod sensors;
 mod tty;
 pub mod ur;
 

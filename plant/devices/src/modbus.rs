@@ -5,6 +5,7 @@ pub(crate) mod server;
 use std::borrow::Cow;
 use std::fmt;
 use std::io;
+use std::sync::{Arc, Mutex as StdMutex, PoisonError, Weak};
 use std::time::Duration;
 
 use tokio::net::TcpStream;
@@ -18,6 +19,9 @@ use crate::tty::Tty;
 
 /// Time limit of an answer. Halt leaves a driver a second, enough for two requests.
 const ANSWER: Duration = Duration::from_millis(300);
+
+/// The connections in use.
+static SHARED: StdMutex<Vec<Weak<Modbus>>> = StdMutex::new(Vec::new());
 
 /// A device behind a line. The connection is opened on request, and opened again after each
 /// fault: a late answer is never used for another request.
@@ -87,6 +91,20 @@ impl Modbus {
             unit,
             context: Mutex::new(None),
         }
+    }
+
+    /// Returns the connection to a unit, which all users of this unit in the program share: many
+    /// devices serve a single connection.
+    pub(crate) fn shared(line: &Line, unit: u8) -> Arc<Self> {
+        let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
+        shared.retain(|known| known.strong_count() > 0);
+        let mut known = shared.iter().filter_map(Weak::upgrade);
+        if let Some(same) = known.find(|known| known.line == *line && known.unit == unit) {
+            return same;
+        }
+        let new = Arc::new(Self::new(line.clone(), unit));
+        shared.push(Arc::downgrade(&new));
+        new
     }
 
     /// Reads holding registers (function 3).

@@ -9,11 +9,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{Device, Driver, DriverFault, Parameters, PeerAccess, Results, TypeName, Work};
+use skills::{
+    Builtin, Device, DeviceValue, Driver, DriverFault, Measured, Parameters, PeerAccess, Results,
+    TypeName, Value, Work,
+};
 use tokio::time::{Instant, sleep};
 
 use crate::line::Line;
 use crate::modbus::Modbus;
+use crate::sensors::{ticks, value};
 
 /// Address of the command registers: action, reserved; reserved, position; speed, force.
 pub const ACTION: u16 = 0x03E8;
@@ -35,11 +39,12 @@ impl Gripper {
     #[must_use]
     pub fn new(line: Line, unit: u8) -> Self {
         Self {
-            modbus: Arc::new(Modbus::new(line, unit)),
+            modbus: Modbus::shared(&line, unit),
         }
     }
 }
 
+#[async_trait]
 impl Device for Gripper {
     fn driver(
         &self,
@@ -63,7 +68,64 @@ impl Device for Gripper {
             "`robotiq_2f85` does the work of GraspSkillType, ReleaseSkillType, MoveGripperSkillType and what is below them, and this is {own}"
         )))
     }
+
+    fn values(&self) -> &'static [DeviceValue] {
+        &VALUES
+    }
+
+    async fn measure(&self, period: Duration, out: &Measured) -> String {
+        let mut ticks = ticks(period);
+        loop {
+            ticks.tick().await;
+            let status = match self.modbus.holding(STATUS, 3).await {
+                Ok(words) => Status::of(&words),
+                Err(fault) => return fault.to_string(),
+            };
+            let Some(status) = status else {
+                return "the gripper answers without its status".to_owned();
+            };
+            out.put(
+                "Active",
+                Ok((status.active && status.activation == 3).into()),
+            );
+            out.put("ObjectDetected", Ok(matches!(status.object, 1 | 2).into()));
+            out.put("Width", Ok(width(status.position).into()));
+            out.put("Current", Ok((f64::from(status.current) * AMPERE).into()));
+            out.put("Fault", Ok(Value::Byte(status.fault)));
+        }
+    }
 }
+
+/// The values of a gripper.
+const VALUES: [DeviceValue; 5] = [
+    value(
+        "Active",
+        Builtin::Boolean,
+        "Whether the gripper is activated.",
+    ),
+    value(
+        "ObjectDetected",
+        Builtin::Boolean,
+        "Whether the fingers were stopped by an object.",
+    ),
+    DeviceValue {
+        unit: Some("m"),
+        range: Some((0.0, STROKE)),
+        ..value("Width", Builtin::Double, "The distance of the fingers.")
+    },
+    DeviceValue {
+        unit: Some("A"),
+        range: Some((0.0, 2.55)),
+        ..value("Current", Builtin::Double, "The current of the motor.")
+    },
+    value(
+        "Fault",
+        Builtin::Byte,
+        "The fault of the gripper (gFLT); 0 for none.",
+    ),
+];
+/// The unit of the current, A.
+const AMPERE: f64 = 0.01;
 
 /// State of the gripper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -80,6 +142,8 @@ struct Status {
     wanted: u8,
     /// gPO: from 0, open, to 255, closed.
     position: u8,
+    /// gCU: the current in 10 mA.
+    current: u8,
 }
 
 impl Status {
@@ -89,7 +153,7 @@ impl Status {
         };
         let [status, _reserved] = status.to_be_bytes();
         let [fault, wanted] = fault.to_be_bytes();
-        let [position, _current] = position.to_be_bytes();
+        let [position, current] = position.to_be_bytes();
         Some(Self {
             active: status & 1 == 1,
             activation: status >> 4 & 3,
@@ -97,6 +161,7 @@ impl Status {
             fault: fault & 0x0F,
             wanted,
             position,
+            current,
         })
     }
 

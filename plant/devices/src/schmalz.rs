@@ -5,18 +5,22 @@
 //! 6 and 7 state of the device. Two values follow. The second value, the vacuum in mbar, has two
 //! bytes, the high byte first. Process data out, 2 bytes: bit 0 vacuum, bit 1 blow off.
 
-mod http;
 pub mod simulator;
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use serde_json::{Value, json};
-use skills::{Device, Driver, DriverFault, PeerAccess, Results, TypeName, Work};
+use skills::{
+    Builtin, Device, DeviceValue, Driver, DriverFault, Measured, PeerAccess, Results, TypeName,
+    Work,
+};
 use tokio::time::{Instant, sleep};
 
-use self::http::Master;
+use crate::http::{Asked, Host};
+use crate::sensors::{ticks, value};
 
 /// A gripper.
 #[derive(Debug, Clone)]
@@ -47,17 +51,14 @@ impl Gripper {
     /// Creates the device of an alias, such as `master1port1`, at the master at `host:port`.
     #[must_use]
     pub fn new(master: &str, alias: &str, timing: Timing) -> Self {
-        let port = Port {
-            master: Master::new(master),
-            alias: alias.to_owned(),
-        };
         Self {
-            port: Arc::new(port),
+            port: Arc::new(Port::new(master, alias)),
             timing,
         }
     }
 }
 
+#[async_trait]
 impl Device for Gripper {
     fn driver(
         &self,
@@ -83,12 +84,61 @@ impl Device for Gripper {
             "`schmalz_ecbpi` does the work of GraspSkillType, ReleaseSkillType and what is below them, and this is {own}"
         )))
     }
+
+    fn values(&self) -> &'static [DeviceValue] {
+        &VALUES
+    }
+
+    async fn measure(&self, period: Duration, out: &Measured) -> String {
+        let mut ticks = ticks(period);
+        loop {
+            ticks.tick().await;
+            let status = match self.port.status().await {
+                Ok(status) => status,
+                Err(why) => return why,
+            };
+            out.put("PartPresent", Ok(status.part_present.into()));
+            out.put("InControlRange", Ok(status.in_control_range.into()));
+            out.put("PartDetached", Ok(status.part_detached.into()));
+            out.put("Vacuum", Ok(skills::Value::UInt16(status.vacuum)));
+            out.put("Health", Ok(skills::Value::Byte(status.health)));
+        }
+    }
 }
+
+/// The values of a gripper.
+const VALUES: [DeviceValue; 5] = [
+    value(
+        "PartPresent",
+        Builtin::Boolean,
+        "Whether the vacuum holds a part.",
+    ),
+    value(
+        "InControlRange",
+        Builtin::Boolean,
+        "Whether the vacuum is in the range of control.",
+    ),
+    value(
+        "PartDetached",
+        Builtin::Boolean,
+        "Whether the part was blown off.",
+    ),
+    DeviceValue {
+        unit: Some("mbar"),
+        range: Some((0.0, 1000.0)),
+        ..value("Vacuum", Builtin::UInt16, "The vacuum at the cups.")
+    },
+    value(
+        "Health",
+        Builtin::Byte,
+        "0 works, 1 works with warnings, 2 with severe warnings, 3 does not work.",
+    ),
+];
 
 /// A port of a master.
 #[derive(Debug)]
-struct Port {
-    master: Master,
+pub(crate) struct Port {
+    master: Host,
     alias: String,
 }
 
@@ -102,6 +152,12 @@ struct Status {
     health: u8,
     /// mbar
     vacuum: u16,
+}
+
+impl fmt::Display for Port {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} at {}", self.alias, self.master)
+    }
 }
 
 impl Status {
@@ -120,12 +176,27 @@ impl Status {
 }
 
 impl Port {
+    /// Creates the port of an alias at the master at `host:port`.
+    pub(crate) fn new(master: &str, alias: &str) -> Self {
+        Self {
+            master: Host(master.to_owned()),
+            alias: alias.to_owned(),
+        }
+    }
+
     async fn status(&self) -> Result<Status, String> {
+        let bytes = self.process_data().await?;
+        let status = Status::of(&bytes);
+        status.ok_or_else(|| self.damaged("the process data are not four bytes"))
+    }
+
+    /// Returns the process data of the device at the port.
+    pub(crate) async fn process_data(&self) -> Result<Vec<u8>, String> {
         let path = format!(
             "{}/{}/processdata/getdata/value?format=byteArray",
             DEVICES, self.alias
         );
-        let answer = self.master.ask("GET", &path, None).await?;
+        let answer = self.ask("GET", &path, None).await?;
         // Both spellings are in use.
         let data = answer.get("ioLink").or_else(|| answer.get("iolink"));
         let data = data.ok_or_else(|| self.damaged("it has no process data"))?;
@@ -144,14 +215,24 @@ impl Port {
                         .map(|byte| byte.as_u64().and_then(|byte| byte.try_into().ok()))
                         .collect()
                 });
-        let status = bytes.as_deref().and_then(Status::of);
-        status.ok_or_else(|| self.damaged("the process data are not four bytes"))
+        bytes.ok_or_else(|| self.damaged("the process data are not bytes"))
     }
 
     async fn set(&self, out: u8) -> Result<(), String> {
         let path = format!("{}/{}/processdata/value", DEVICES, self.alias);
         let data = json!({"ioLink": {"valid": true, "value": [out, 0]}});
-        self.master.ask("POST", &path, Some(&data)).await.map(drop)
+        self.ask("POST", &path, Some(&data)).await.map(drop)
+    }
+
+    async fn ask(&self, method: &str, path: &str, body: Option<&Value>) -> Result<Value, String> {
+        let asked = Asked {
+            method,
+            path,
+            body,
+            within: ANSWER,
+        };
+        let answer = self.master.ask(asked).await;
+        answer.map_err(|fault| fault.to_string())
     }
 
     fn damaged(&self, why: &str) -> String {
@@ -228,6 +309,8 @@ impl Motion {
     }
 }
 
+/// Halt leaves a driver a second, enough for two requests.
+const ANSWER: Duration = Duration::from_millis(400);
 const DEVICES: &str = "/iolink/v1/devices";
 const VACUUM: u8 = 1;
 const BLOW_OFF: u8 = 2;

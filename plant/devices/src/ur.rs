@@ -5,6 +5,7 @@
 //! program of another client is never mistaken for it. Suspending sets the speed slider to zero,
 //! halting brakes along the path.
 
+mod force;
 mod pose;
 mod rtde;
 mod script;
@@ -15,15 +16,20 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{Device, Driver, DriverFault, Parameters, PeerAccess, Results, TypeName, Work};
+use skills::{
+    Builtin, Device, DeviceValue, Driver, DriverFault, Measured, Parameters, PeerAccess, Results,
+    Shape, TypeName, Work,
+};
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout};
 
+use self::force::Guard;
 pub use self::pose::{of_robot, to_robot};
 use self::rtde::Rtde;
 use self::wire::Value;
 use crate::modbus::connected;
+use crate::sensors::value;
 
 /// The port for programs.
 pub const SECONDARY: u16 = 30_002;
@@ -69,6 +75,7 @@ impl Robot {
     }
 }
 
+#[async_trait]
 impl Device for Robot {
     fn driver(
         &self,
@@ -77,17 +84,121 @@ impl Device for Robot {
     ) -> Result<Arc<dyn Driver>, DriverFault> {
         let is = |name: &str| types.contains(&TypeName::own(name));
         let settings = Arc::clone(&self.settings);
-        let motion = |linear| -> Arc<dyn Driver> { Arc::new(Motion { settings, linear }) };
+        let motion = |linear, guarded| -> Arc<dyn Driver> {
+            Arc::new(Motion {
+                settings,
+                linear,
+                guarded,
+            })
+        };
         if is("PtpMoveSkillType") {
-            return Ok(motion(false));
+            return Ok(motion(false, false));
+        }
+        // A subtype of LinearMoveSkillType.
+        if is("ForceMoveSkillType") {
+            return Ok(motion(true, true));
         }
         if is("LinearMoveSkillType") {
-            return Ok(motion(true));
+            return Ok(motion(true, false));
         }
         let own = types.first().map(TypeName::to_string).unwrap_or_default();
         Err(DriverFault(format!(
-            "`universal_robot` does the work of PtpMoveSkillType, LinearMoveSkillType and what is below them, and this is {own}"
+            "`universal_robot` does the work of PtpMoveSkillType, LinearMoveSkillType, ForceMoveSkillType and what is below them, and this is {own}"
         )))
+    }
+
+    fn values(&self) -> &'static [DeviceValue] {
+        &VALUES
+    }
+
+    /// The robot sends its state at the rate of the period.
+    async fn measure(&self, period: Duration, out: &Measured) -> String {
+        let hertz = (1.0 / period.as_secs_f64()).clamp(1.0, FASTEST_VALUES);
+        let recipe = MEASURED.map(|(_, output)| output);
+        let opened = Rtde::open(&self.settings.rtde, hertz, &recipe, &[]).await;
+        let mut rtde = match opened {
+            Ok(rtde) => rtde,
+            Err(why) => return why,
+        };
+        loop {
+            let values = match rtde.next().await {
+                Ok(values) => values,
+                Err(why) => return why,
+            };
+            for ((name, _), value) in MEASURED.iter().zip(values) {
+                out.put(name, shown(name, value));
+            }
+        }
+    }
+}
+
+/// Returns a value of the robot for clients.
+fn shown(name: &str, value: Value) -> Result<skills::Value, String> {
+    Ok(match value {
+        Value::Vector(pose) if name == "TcpPose" => of_robot(pose).into(),
+        Value::Vector(six) => six.into(),
+        Value::I32(number) => number.into(),
+        Value::F64(number) if name == "SpeedScaling" => (number * 100.0).into(),
+        Value::F64(number) => number.into(),
+        other @ (Value::Bool(_)
+        | Value::U8(_)
+        | Value::U32(_)
+        | Value::U64(_)
+        | Value::Triple(_)
+        | Value::Whole(_)) => return Err(format!("the robot sends {name} as {other:?}")),
+    })
+}
+
+/// The values of a robot and the outputs of RTDE with them.
+const MEASURED: [(&str, &str); 7] = [
+    ("TcpPose", "actual_TCP_pose"),
+    ("TcpSpeed", "actual_TCP_speed"),
+    ("TcpForce", "actual_TCP_force"),
+    ("JointPositions", "actual_q"),
+    ("SpeedScaling", "target_speed_fraction"),
+    ("RobotMode", "robot_mode"),
+    ("SafetyMode", "safety_mode"),
+];
+
+const VALUES: [DeviceValue; 7] = [
+    six(
+        "TcpPose",
+        None,
+        "The pose of the flange: x, y, z in m and the rotations about them in rad.",
+    ),
+    six("TcpSpeed", None, "The speed of the flange: m/s, and rad/s."),
+    six("TcpForce", None, "The force at the tool: N, and N m."),
+    six(
+        "JointPositions",
+        Some("rad"),
+        "The positions of the joints.",
+    ),
+    DeviceValue {
+        unit: Some("%"),
+        range: Some((0.0, 100.0)),
+        ..value(
+            "SpeedScaling",
+            Builtin::Double,
+            "The position of the speed slider.",
+        )
+    },
+    value(
+        "RobotMode",
+        Builtin::Int32,
+        "7 runs, 5 waits for the release of its brakes, 3 is switched off.",
+    ),
+    value(
+        "SafetyMode",
+        Builtin::Int32,
+        "1 normal, 2 reduced, 3 protective stop, 5 safeguard stop, 6 and 7 emergency stop, 8 and 9 fault.",
+    ),
+];
+
+const fn six(name: &'static str, unit: Option<&'static str>, about: &'static str) -> DeviceValue {
+    DeviceValue {
+        shape: Shape::array(Builtin::Double),
+        unit,
+        ..value(name, Builtin::Double, about)
     }
 }
 
@@ -96,6 +207,8 @@ impl Device for Robot {
 struct Motion {
     settings: Arc<Settings>,
     linear: bool,
+    /// Whether the move ends at the force of the parameter MaxForce.
+    guarded: bool,
 }
 
 /// State of the robot.
@@ -111,9 +224,11 @@ struct State {
     slider: f64,
     started: i32,
     done: i32,
+    /// Force and torque at the tool, in the frame of the base.
+    force: [f64; 6],
 }
 
-const OUTPUTS: [&str; 8] = [
+const OUTPUTS: [&str; 9] = [
     "actual_TCP_pose",
     "actual_TCP_speed",
     "robot_mode",
@@ -122,6 +237,7 @@ const OUTPUTS: [&str; 8] = [
     "target_speed_fraction",
     "output_int_register_24",
     "output_int_register_25",
+    "actual_TCP_force",
 ];
 const INPUTS: [&str; 2] = ["speed_slider_mask", "speed_slider_fraction"];
 
@@ -136,6 +252,7 @@ impl State {
             Value::F64(slider),
             Value::I32(started),
             Value::I32(done),
+            Value::Vector(force),
         ] = values
         else {
             return None;
@@ -149,6 +266,7 @@ impl State {
             slider: *slider,
             started: *started,
             done: *done,
+            force: *force,
         })
     }
 
@@ -184,6 +302,9 @@ impl Driver for Motion {
                 "TargetPosition is {far:.3} m from the base, and the robot reaches {reach} m"
             ));
         }
+        if self.guarded {
+            Guard::of(parameters)?;
+        }
         match parameters.text("ToolFrame") {
             None | Some("flange") => Ok(()),
             Some(_) => Err("ToolFrame is `flange` with this robot".to_owned()),
@@ -191,7 +312,12 @@ impl Driver for Motion {
     }
 
     async fn run(&self, work: Work) -> Result<Results, String> {
-        let mut session = Session::open(&self.settings).await?;
+        let mut guard = match self.guarded {
+            true => Some(Guard::of(work.parameters())?),
+            false => None,
+        };
+        let hertz = if self.guarded { GUARDED } else { HERTZ };
+        let mut session = Session::open(&self.settings, hertz).await?;
         let at = session.state().await?;
         at.fit()?;
         // Differs from the token of the last program of any client.
@@ -199,8 +325,15 @@ impl Driver for Motion {
         work.step("Move").await;
         let program = self.program(work.parameters(), token)?;
         let _program = self.send(&program).await?;
-        let ended = session.follow(self, &work, token).await?;
-        Ok(vec![("Position".to_owned(), of_robot(ended.pose).into())])
+        if let Some(guard) = &mut guard {
+            guard.zero(at.force);
+        }
+        let ended = session.follow((self, &work), token, &mut guard).await?;
+        let mut results = vec![("Position".to_owned(), of_robot(ended.pose).into())];
+        if let Some(guard) = guard {
+            results.extend(guard.results());
+        }
+        Ok(results)
     }
 }
 
@@ -246,8 +379,8 @@ struct Session {
 }
 
 impl Session {
-    async fn open(settings: &Settings) -> Result<Self, String> {
-        let rtde = Rtde::open(&settings.rtde, HERTZ, &OUTPUTS, &INPUTS).await?;
+    async fn open(settings: &Settings, hertz: f64) -> Result<Self, String> {
+        let rtde = Rtde::open(&settings.rtde, hertz, &OUTPUTS, &INPUTS).await?;
         Ok(Self { rtde })
     }
 
@@ -262,7 +395,12 @@ impl Session {
 
     /// Follows the run until the program is done. No future is dropped on the way: the robot sends
     /// its state often enough to check the run in between.
-    async fn follow(&mut self, motion: &Motion, work: &Work, token: i32) -> Result<State, String> {
+    async fn follow(
+        &mut self,
+        (motion, work): (&Motion, &Work),
+        token: i32,
+        guard: &mut Option<Guard>,
+    ) -> Result<State, String> {
         let asked = Instant::now();
         let mut standing = None;
         loop {
@@ -271,6 +409,12 @@ impl Session {
                 return Ok(at);
             }
             at.fit()?;
+            if let Some(guard) = guard
+                && guard.exceeded(at.force, at.pose)
+            {
+                work.note(guard.to_string()).await;
+                return self.brake(motion, standing).await;
+            }
             if at.started == token && !at.program {
                 return Err("the program of the robot has ended before its move: another one took its place".to_owned());
             }
@@ -299,8 +443,14 @@ impl Session {
         }
     }
 
-    /// Brakes, and returns the position of the robot after that.
+    /// Brakes, and returns the position of the robot after that as text.
     async fn halt(&mut self, motion: &Motion, slider: Option<f64>) -> Result<String, String> {
+        let [x, y, z, ..] = self.brake(motion, slider).await?.pose;
+        Ok(format!("stopped at {x:.3}, {y:.3}, {z:.3} m"))
+    }
+
+    /// Brakes, and returns the state of the robot after that.
+    async fn brake(&mut self, motion: &Motion, slider: Option<f64>) -> Result<State, String> {
         let _program = motion.send("def ua_halt():\n  stopl(3.0)\nend\n").await?;
         let asked = Instant::now();
         let at = loop {
@@ -313,8 +463,7 @@ impl Session {
         if let Some(slider) = slider {
             self.slide(slider).await?;
         }
-        let [x, y, z, ..] = at.pose;
-        Ok(format!("stopped at {x:.3}, {y:.3}, {z:.3} m"))
+        Ok(at)
     }
 }
 
@@ -357,7 +506,11 @@ async fn is(ready: impl Future<Output = ()>) -> bool {
 /// `runtime_state` of a running program.
 const PLAYING: u32 = 2;
 const HERTZ: f64 = 50.0;
+/// Rate of the state of a move with a force limit, Hz.
+const GUARDED: f64 = 125.0;
 const FOLLOWED: f64 = 500.0;
+/// Highest rate of values for clients, Hz.
+const FASTEST_VALUES: f64 = 125.0;
 const TAKEN: Duration = Duration::from_secs(2);
 const SETTLED: Duration = Duration::from_millis(60);
 const BRAKED: Duration = Duration::from_millis(700);

@@ -303,7 +303,8 @@ impl Actor {
         let given = given
             .parameters
             .unwrap_or_else(|| lock(&self.pending).given(by));
-        let parameters = Parameters::complete(&self.facts.parameters, given)?;
+        let prepared = self.driver.prepared(&self.facts.parameters, given.clone());
+        let parameters = Parameters::complete(&self.facts.parameters, prepared)?;
         self.driver
             .check(&parameters)
             .map_err(|why| Refusal::new(Code::InvalidArgument, why))?;
@@ -311,7 +312,8 @@ impl Actor {
         let begun = self.begin(by, is_halted).await;
         let (transition, run) = begun.inspect_err(|_| self.authority.end(&self.facts.name))?;
         self.trace.clear();
-        lock(&self.pending).kept(by, parameters.all());
+        // The configuration may differ at the next run.
+        lock(&self.pending).kept(by, &given);
         self.now.parameters = Arc::new(parameters.clone());
         self.now.run = run.number();
         self.now.progress = 0.0;

@@ -1,9 +1,11 @@
 //! Describes a component: its name, its address and its skills.
 
+mod configurable;
 mod device;
 mod document;
 mod drivers;
 mod space;
+mod values;
 mod world;
 
 use std::fmt;
@@ -15,13 +17,16 @@ use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
 use plant_opcua::users::{Role, Roles};
 
-pub use device::{Device, DeviceKinds, NoDevices};
+pub(crate) use device::DeviceSensor;
+pub use device::{Device, DeviceKinds, NoDevices, measure_device};
 pub use document::{read_partner, read_user};
 pub use drivers::{DriverFault, Drivers};
 pub use space::{Asked, Form, Part, Source, SpaceWork};
 
+pub use values::{ExecSource, MOST_VALUES, SensorRead, TopicSource, ValueSetup, ValueSource};
 pub use world::{World, WorldObject, read_numbers, read_shape};
 
+use crate::configuration::Configurable;
 use crate::driver::Driver;
 use crate::grip::GripPoint;
 use crate::parameters::TypeName;
@@ -62,6 +67,10 @@ pub struct Component {
     pub power_off: bool,
     /// The objects of the cell by their ObjectIds, for composites.
     pub world: World,
+    /// The values that it shows beside its skills.
+    pub values: Vec<ValueSetup>,
+    /// The fields of its configuration.
+    pub configurable: Vec<Configurable>,
     /// The skills, by their numbers from 1.
     pub skills: Vec<SkillSetup>,
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use tokio::sync::{mpsc, watch};
 
-use crate::parameters::Parameters;
+use crate::parameters::{Parameter, Parameters};
 use crate::value::Value;
 
 /// The results of a run, by their names in the skill type.
@@ -40,6 +40,16 @@ pub trait Driver: Send + Sync + 'static {
         Ok(())
     }
 
+    /// Changes the given parameters of a run before they are completed by defaults and checked.
+    fn prepared(
+        &self,
+        declared: &[Parameter],
+        given: Vec<(String, Value)>,
+    ) -> Vec<(String, Value)> {
+        let _all = declared;
+        given
+    }
+
     /// Returns the skills of other components that do the work, as `<endpoint> <type>`, for
     /// display.
     fn uses(&self) -> Vec<String> {
@@ -60,6 +70,7 @@ pub trait Driver: Send + Sync + 'static {
 pub struct Work {
     run: u32,
     parameters: Parameters,
+    configuration: Results,
     signal: watch::Receiver<Signal>,
     steps: mpsc::Sender<Line>,
     progress: watch::Sender<f32>,
@@ -113,6 +124,7 @@ impl Work {
         let work = Self {
             run,
             parameters,
+            configuration: Vec::new(),
             signal: signals,
             steps,
             progress,
@@ -135,6 +147,19 @@ impl Work {
     #[must_use]
     pub fn parameters(&self) -> &Parameters {
         &self.parameters
+    }
+
+    /// Returns the configured values of the component that act on the skill.
+    #[must_use]
+    pub fn configuration(&self) -> &[(String, Value)] {
+        &self.configuration
+    }
+
+    pub(crate) fn with_configuration(self, configuration: Vec<(String, Value)>) -> Self {
+        Self {
+            configuration,
+            ..self
+        }
     }
 
     /// Reports the current step of the run. Waits while the queue of reports is full; no step is

@@ -9,6 +9,7 @@ mod authority;
 pub mod client;
 mod component;
 mod composite;
+mod configuration;
 pub mod conformance;
 mod driver;
 pub mod frame;
@@ -23,6 +24,7 @@ mod shown;
 pub mod simulated;
 mod skill;
 mod value;
+mod values;
 mod variant;
 pub mod yaml;
 
@@ -32,12 +34,14 @@ pub use client::{
     PeerAccess, RemoteState, SkillClient, SkillHandle, ToolState, Watchable,
 };
 pub use component::{
-    Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, ExecWork, Form,
-    LEASE, Lds, MOST_SKILLS, NoDevices, Part, Partner, Partners, Robot, Security, Simulation,
-    SkillSetup, Source, SpaceWork, World, WorldObject, anonymous_by_default, read_numbers,
+    Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, ExecSource, ExecWork,
+    Form, LEASE, Lds, MOST_SKILLS, MOST_VALUES, NoDevices, Part, Partner, Partners, Robot,
+    Security, SensorRead, Simulation, SkillSetup, Source, SpaceWork, TopicSource, ValueSetup,
+    ValueSource, World, WorldObject, anonymous_by_default, measure_device, read_numbers,
     read_partner, read_shape, read_user,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
+pub use configuration::{Configurable, Configuration, Effect, NotConfigured};
 pub use driver::{Driver, Results, Stopped, Work};
 pub use grip::{GripPoint, GripType, NoShape, PartShape};
 pub use model::NAMESPACE;
@@ -48,3 +52,6 @@ pub use runs::{COMPOSITE_HALT_TIMEOUT, LocalRun, Runs, SkillFault};
 pub use shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
 pub use skill::{Facts, Skill};
 pub use value::{Builtin, Shape, Value};
+pub use values::{
+    DeviceValue, LiveValue, Measure, Measured, Reading, Sensor, Statistics, Tally, ValueFacts,
+};

@@ -4,6 +4,7 @@ pub mod alias;
 mod nodeset;
 mod table;
 mod types;
+mod units;
 
 pub use nodeset::nodeset;
 pub use table::{Preset, SkillType, Unit, Variable};

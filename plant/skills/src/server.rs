@@ -10,11 +10,14 @@
 //! - `show`: values and events for clients
 //! - `methods`: methods and writes of clients
 //! - `lock`: the lease as a lock of OPC 10000-100
+//! - `configuration`: the configuration of the component
 //! - `grip`: the grip point of a grasp skill
 //! - `robot`: the robot for clients of OPC 40010-1
 //! - `tool`: the state of a tool changer
 //! - `uses`: the skills that composites use
+//! - `values`: the values of the component
 
+mod configuration;
 mod grip;
 mod lock;
 mod methods;
@@ -25,6 +28,7 @@ mod show;
 mod tool;
 mod types;
 mod uses;
+mod values;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -46,14 +50,18 @@ use self::methods::status;
 pub use self::power::PowerOff;
 use self::show::{Nodes, Shower};
 pub(crate) use self::types::OUTCOME;
+use self::values::Tallies;
+pub use self::values::status as value_status;
 use crate::authority::{Authority, Owner};
 use crate::client::PeerAccess;
 use crate::component::{Component, Drivers, Security, SkillSetup};
+use crate::configuration::Configuration;
 use crate::driver::Driver;
 use crate::model::{self, NAMESPACE};
-use crate::parameters::TypeName;
+use crate::parameters::{Parameter, TypeName};
 use crate::shown::Observer;
 use crate::skill::{Facts, Skill};
+use crate::values::LiveValue;
 use crate::yaml::{Code, Finding, Findings};
 
 /// Settings of the server of a component, beside the component.
@@ -72,6 +80,9 @@ pub struct ServeSettings {
     pub supervision: Supervision,
     /// Ends the program for `PowerOffDevice`; `None` for a component without this method.
     pub power_off: Option<PowerOff>,
+    /// The file with the configuration of the component; `None` for a configuration that is lost
+    /// at the end of the program.
+    pub configuration: Option<PathBuf>,
 }
 
 /// The reason why a component cannot be served.
@@ -88,11 +99,18 @@ pub enum ServeFault {
     Space(String),
 }
 
+impl From<InstanceError> for ServeFault {
+    fn from(error: InstanceError) -> Self {
+        Self::Space(error.to_string())
+    }
+}
+
 /// A served component, until [`stop`](Self::stop).
 pub struct ComponentServer {
     server: Server,
     authority: Authority,
     skills: Vec<Skill>,
+    values: Vec<LiveValue>,
     tasks: JoinSet<()>,
 }
 
@@ -115,27 +133,23 @@ impl ComponentServer {
         let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
         let root = root(&server, component, &mut ids)?;
         let configure_by = (settings.supervision.clone(), Arc::clone(&users));
-        place::configurable(&server, &root.node_id, &mut ids, configure_by)
-            .map_err(|error| ServeFault::Space(error.to_string()))?;
+        place::configurable(&server, &root.node_id, &mut ids, configure_by)?;
         let folder = root
             .node("Skills")
             .cloned()
             .ok_or_else(|| ServeFault::Space("it has no folder Skills".to_owned()))?;
-        let mut drivers = Drivers::new(component, settings.peers.clone());
-        let mut findings = Findings::default();
-        let mut made = Vec::new();
-        for (number, setup) in (1..).zip(&component.skills) {
-            match make(&server, (number, setup), &folder, &mut drivers, &mut ids) {
-                Ok(skill) => made.push(skill),
-                Err(finding) => findings.push(finding),
-            }
-        }
-        if let Some(finding) = robot::lacks_types(&server, component.robot.as_ref()) {
-            findings.push(finding);
-        }
-        if !findings.is_empty() {
+        let drivers = Drivers::new(component, settings.peers.clone());
+        let (made, mut findings) = make_all(&server, component, &folder, drivers, &mut ids);
+        let tallies = Tallies::of(component);
+        let values = values::made(component, &tallies);
+        findings.extend(values.as_ref().err().cloned());
+        let (Ok(values), true) = (values, findings.is_empty()) else {
             return Err(ServeFault::Findings(findings));
-        }
+        };
+        let store = settings.configuration.as_deref();
+        let configuration = Configuration::new(component.configurable.clone(), store);
+        let by = (settings.supervision.clone(), Arc::clone(&users));
+        let shown = configuration::serve(&server, &root.node_id, &mut ids, (&configuration, by))?;
         let authority = Authority::new();
         let mut served = Vec::new();
         let mut used = Vec::new();
@@ -143,10 +157,12 @@ impl ComponentServer {
             let (facts, driver, nodes) = (made.facts, made.driver, made.nodes);
             let mut all: Vec<Box<dyn Observer>> =
                 vec![Box::new(Shower::new(server.clone(), Arc::clone(&nodes)))];
+            all.extend(tallies.observers(number, &facts.name));
             all.extend(observers(number, &facts));
             let uses = driver.uses();
             nodes.show_at_first(&server, &facts, &uses);
             used.push((nodes.skill().clone(), uses));
+            let driver = configuration.applied(&facts.name, driver);
             let first = settings.first_run;
             let skill = Skill::counting_from(first, facts, driver, authority.clone(), all);
             methods::serve(&server, &nodes, &skill);
@@ -155,8 +171,7 @@ impl ComponentServer {
         let skills: Vec<Skill> = served.iter().map(|(skill, _)| skill.clone()).collect();
         if let Some(power_off) = settings.power_off.clone() {
             let by = (power_off, users);
-            power::serve(&server, &root.node_id, &mut ids, &skills, by)
-                .map_err(|error| ServeFault::Space(error.to_string()))?;
+            power::serve(&server, &root.node_id, &mut ids, &skills, by)?;
         }
         let mut tasks = JoinSet::new();
         if let Some(device) = component.device.clone() {
@@ -169,14 +184,15 @@ impl ComponentServer {
             authority: authority.clone(),
         };
         tasks.spawn(leases.free(component.lease));
-        uses::show(&server, &root.node_id, &used, &mut ids)
-            .map_err(|error| ServeFault::Space(error.to_string()))?;
-        let locking = Lock::serve(&server, &authority, &root.node_id, &mut ids);
-        tasks.spawn(locking.map_err(|error| ServeFault::Space(error.to_string()))?);
+        uses::show(&server, &root.node_id, &used, &mut ids)?;
+        tasks.spawn(Lock::serve(&server, &authority, &root.node_id, &mut ids)?);
         if let Some(robot) = &component.robot {
-            let kept = robot::serve(&server, (&component.name, robot), &skills, &mut ids);
-            tasks.spawn(kept.map_err(|error| ServeFault::Space(error.to_string()))?);
+            let kept = robot::serve(&server, (&component.name, robot), &skills, &mut ids)?;
+            tasks.spawn(kept);
         }
+        tasks.spawn(shown);
+        let values = (values, &configuration);
+        let values = values::serve(&server, &root.node_id, &mut ids, values, &mut tasks)?;
         if let Some(node) = root.node("LeaseHolder") {
             let node = node.clone();
             tasks.spawn(show_holder(server.clone(), node, authority.holder()));
@@ -185,6 +201,7 @@ impl ComponentServer {
             server,
             authority,
             skills,
+            values,
             tasks,
         })
     }
@@ -213,6 +230,12 @@ impl ComponentServer {
     #[must_use]
     pub fn skills(&self) -> &[Skill] {
         &self.skills
+    }
+
+    /// Returns the values, by their numbers from 1.
+    #[must_use]
+    pub fn values(&self) -> &[LiveValue] {
+        &self.values
     }
 
     /// Returns the authority, which controls the lease.
@@ -299,6 +322,35 @@ struct Made {
     facts: Facts,
     driver: Arc<dyn Driver>,
     nodes: Arc<Nodes>,
+}
+
+/// Creates the skills of a component. Returns them with the findings.
+fn make_all(
+    server: &Server,
+    component: &Component,
+    folder: &NodeId,
+    mut drivers: Drivers,
+    ids: &mut IdRange,
+) -> (Vec<Made>, Findings) {
+    let mut findings = Findings::default();
+    let mut made = Vec::new();
+    for (number, setup) in (1..).zip(&component.skills) {
+        match make(server, (number, setup), folder, &mut drivers, ids) {
+            Ok(skill) => made.push(skill),
+            Err(finding) => findings.push(finding),
+        }
+    }
+    let parameters: Vec<(&str, &[Parameter])> = made
+        .iter()
+        .map(|made| (made.facts.name.as_str(), made.facts.parameters.as_slice()))
+        .collect();
+    // Parameters of skills with findings are unknown.
+    if findings.is_empty() {
+        let unknown = component.configurable.iter();
+        findings.extend(unknown.filter_map(|field| field.lacks_parameter(&parameters)));
+    }
+    findings.extend(robot::lacks_types(server, component.robot.as_ref()));
+    (made, findings)
 }
 
 /// Returns the remedy for a skill type that no NodeSet defines.

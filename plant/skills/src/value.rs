@@ -218,6 +218,22 @@ impl Value {
         }
     }
 
+    /// Converts a JSON value: numbers become Doubles, and arrays of numbers arrays of Doubles. A
+    /// skill converts them to the declared type. `None` for other values.
+    #[must_use]
+    pub fn of_json(json: &Json) -> Option<Self> {
+        match json {
+            Json::Bool(value) => Some(Self::from(*value)),
+            Json::Number(number) => number.as_f64().map(Self::from),
+            Json::String(text) => Some(Self::from(text.as_str())),
+            Json::Array(elements) => {
+                let numbers: Option<Vec<f64>> = elements.iter().map(Json::as_f64).collect();
+                numbers.map(Self::from)
+            }
+            Json::Null | Json::Object(_) => None,
+        }
+    }
+
     /// Returns a scalar number of any type as Double.
     #[must_use]
     pub fn as_f64(&self) -> Option<f64> {

@@ -187,3 +187,49 @@ fn a_line_is_progress_or_the_end() {
         assert!(reported(wrong).is_err(), "{wrong}");
     }
 }
+
+#[path = "../../examples/own_gripper.rs"]
+mod example;
+
+/// Returns the lines of the example program for these lines of the component.
+fn lines_of_the_example(action: &str, lines: &[Json], halts: bool) -> Vec<Json> {
+    let (sender, receiver) = std::sync::mpsc::channel();
+    for line in lines {
+        sender.send(line.to_string()).unwrap();
+    }
+    // The end of the input halts the program.
+    let _open = (!halts).then_some(sender);
+    let mut said = Vec::new();
+    example::run(action, &receiver, |message| said.push(message)).unwrap();
+    said
+}
+
+#[test]
+fn the_example_in_rust_speaks_the_lines_of_programs() {
+    let start = json!({"start": {"skill": "Grasp", "run": 1, "parameters": {"Force": 7.5}}});
+    let said = lines_of_the_example("grasp", std::slice::from_ref(&start), false);
+    let said: Vec<Report> = said
+        .iter()
+        .map(|line| reported(&line.to_string()).unwrap())
+        .collect();
+    let gripped = vec![("Gripped".to_owned(), Value::from(true))];
+    assert_eq!(said.last(), Some(&Report::Ended(Ok(gripped))));
+    assert_eq!(said.len(), 12);
+    let said = lines_of_the_example("grasp", &[start], true);
+    let last = reported(&said.last().unwrap().to_string()).unwrap();
+    assert_eq!(last, Report::Ended(Err("halted at 10 %".to_owned())));
+}
+
+#[test]
+fn the_schema_has_the_keys_that_are_read() {
+    let schema: Json = serde_json::from_str(SCHEMA).unwrap();
+    let lines = schema["$defs"]["from_skill"]["oneOf"].as_array().unwrap();
+    let keys = lines
+        .iter()
+        .flat_map(|line| line["properties"].as_object().unwrap().keys());
+    let mut keys: Vec<&str> = keys.map(String::as_str).collect();
+    let mut known = KEYS.to_vec();
+    keys.sort_unstable();
+    known.sort_unstable();
+    assert_eq!(keys, known);
+}

@@ -49,9 +49,25 @@ pub(crate) struct New {
     /// The kind of the file
     #[arg(value_name = "KIND", value_enum)]
     pub(crate) template: Template,
+    /// How the skills of a component do their work
+    #[arg(long, value_name = "DRIVER", value_enum, default_value_t = DriverTemplate::Simulated)]
+    pub(crate) driver: DriverTemplate,
     /// The file, which must not exist. Without it: stdout
     #[arg(short, long, value_name = "FILE")]
     pub(crate) output: Option<PathBuf>,
+}
+
+/// The driver in the starting file of a component.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum DriverTemplate {
+    /// A simulation
+    Simulated,
+    /// An action or a service of ROS
+    Ros,
+    /// A program of your own
+    Exec,
+    /// The HTTP interface of a device
+    Http,
 }
 
 /// The kind of a starting file.

@@ -187,3 +187,28 @@ fn the_force_is_told_in_the_unit_of_the_gripper() {
         [0, 0, 128, 255, 255]
     );
 }
+
+#[tokio::test]
+async fn its_values_follow_the_fingers_beside_its_skills() {
+    let bench = bench(LINES[0], Some(0.04)).await;
+    let gripper: Arc<dyn Device> = Arc::new(Gripper::new(bench.serving.line().clone(), UNIT));
+    let values = crate::sensors::tests::measured(gripper);
+    values
+        .until("Active", |value| *value == Ok(false.into()))
+        .await;
+    assert_eq!(bench.run("GraspSkillType").await, (true, String::new()));
+    values
+        .until("Active", |value| *value == Ok(true.into()))
+        .await;
+    values
+        .until("ObjectDetected", |value| *value == Ok(true.into()))
+        .await;
+    values
+        .until("Width", |value| {
+            let width = value.as_ref().ok().and_then(Value::as_f64);
+            width.is_some_and(|width| (width - 0.04).abs() < 0.001)
+        })
+        .await;
+    bench.faults.set_silent(true);
+    values.until("Width", Result::is_err).await;
+}

@@ -107,3 +107,37 @@ async fn silence_damaged_answers_and_a_gripper_without_power_are_told_and_do_not
     bench.simulator.reboot();
     assert!(bench.run("GraspSkillType").await.0);
 }
+
+#[tokio::test]
+async fn its_values_follow_the_part_and_are_unknown_while_it_is_unplugged() {
+    let bench = bench(true).await;
+    let gripper: Arc<dyn Device> = Arc::new(Gripper::new(
+        &bench.serving.address().to_string(),
+        "master1port1",
+        Timing::default(),
+    ));
+    let values = crate::sensors::tests::measured(gripper);
+    values
+        .until("PartPresent", |value| *value == Ok(false.into()))
+        .await;
+    bench.run("GraspSkillType").await;
+    values
+        .until("PartPresent", |value| *value == Ok(true.into()))
+        .await;
+    values
+        .until("Vacuum", |value| {
+            value
+                .as_ref()
+                .is_ok_and(|mbar| mbar.as_f64().is_some_and(|mbar| mbar > 100.0))
+        })
+        .await;
+    bench.simulator.set_faults(Faults {
+        unplugged: true,
+        ..Faults::default()
+    });
+    values.until("Vacuum", Result::is_err).await;
+    bench.simulator.set_faults(Faults::default());
+    values
+        .until("PartPresent", |value| *value == Ok(true.into()))
+        .await;
+}

@@ -26,6 +26,8 @@ pub struct Settings {
     pub time_scale: f64,
     /// Pose of the tool after power-on: x, y, z and a rotation vector.
     pub home: [f64; 6],
+    /// The height of a surface that pushes the tool back, m; `None` for none.
+    pub surface: Option<f64>,
 }
 
 impl Default for Settings {
@@ -33,6 +35,7 @@ impl Default for Settings {
         Self {
             time_scale: 1.0,
             home: [0.4, 0.0, 0.5, 0.0, 0.0, 0.0],
+            surface: None,
         }
     }
 }
@@ -153,6 +156,13 @@ impl Robot {
         RUNNING
     }
 
+    /// Returns the force at the tool: that of the surface, N.
+    fn force(&self) -> [f64; 6] {
+        let [_, _, z, ..] = self.pose;
+        let depth = self.settings.surface.map_or(0.0, |surface| surface - z);
+        [0.0, 0.0, depth.max(0.0) * STIFFNESS, 0.0, 0.0, 0.0]
+    }
+
     fn velocity(&self) -> [f64; 6] {
         let motion = self
             .program
@@ -229,6 +239,8 @@ fn tidy([x, y, z, rx, ry, rz]: [f64; 6]) -> [f64; 6] {
     [x, y, z, rx, ry, rz]
 }
 
+/// Force of the surface for each m below it, N/m.
+const STIFFNESS: f64 = 5_000.0;
 /// `robot_mode` of a robot that is ready.
 const RUNNING: i32 = 7;
 /// `safety_mode`

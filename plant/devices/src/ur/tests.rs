@@ -9,8 +9,13 @@ struct Bench {
 }
 
 async fn bench() -> Bench {
+    bench_at(20.0, None).await
+}
+
+async fn bench_at(time_scale: f64, surface: Option<f64>) -> Bench {
     let settings = simulator::Settings {
-        time_scale: 20.0,
+        time_scale,
+        surface,
         ..simulator::Settings::default()
     };
     let simulator = Simulator::new(settings);
@@ -45,13 +50,21 @@ impl Bench {
 
 #[tokio::test]
 async fn its_drivers_are_as_drivers_should_be() {
-    for of in ["PtpMoveSkillType", "LinearMoveSkillType"] {
+    for of in [
+        "PtpMoveSkillType",
+        "LinearMoveSkillType",
+        "ForceMoveSkillType",
+    ] {
         let bench = bench().await;
         let mut corners = [[-0.4, 0.3, 0.2], [0.4, 0.3, -0.2], [0.1, -0.5, 0.4]];
         let around = || {
             corners.rotate_left(1);
             let [x, y, z] = corners[0];
-            to([x, y, z, 0.0, x, 0.0])
+            let mut parameters = to([x, y, z, 0.0, x, 0.0]);
+            if of == "ForceMoveSkillType" {
+                parameters.push(("MaxForce".to_owned(), vec![0.0, 0.0, 30.0].into()));
+            }
+            parameters
         };
         conformance::check(of, bench.driver(of), around)
             .await
@@ -148,4 +161,70 @@ async fn what_it_cannot_reach_is_refused_before_anything_is_sent() {
     let expected =
         "BadInvalidArgument: TargetPosition is 0.900 m from the base, and the robot reaches 0.85 m";
     assert_eq!(refused.unwrap_err(), expected);
+}
+
+#[tokio::test]
+async fn its_values_follow_the_robot_and_come_back_after_a_silence() {
+    let bench = bench().await;
+    let robot: Arc<dyn Device> = Arc::new(Robot::new(Settings {
+        rtde: bench.serving.rtde().to_string(),
+        secondary: bench.serving.secondary().to_string(),
+        reach: REACH,
+    }));
+    let values = crate::sensors::tests::measured(robot);
+    let at = |x: f64| {
+        move |value: &Result<skills::Value, String>| {
+            let pose = value.as_ref().ok().and_then(skills::Value::as_f64s);
+            pose.is_some_and(|pose| pose.first().is_some_and(|found| (found - x).abs() < 1e-4))
+        }
+    };
+    values.until("TcpPose", at(0.4)).await;
+    let outcome = bench
+        .run("LinearMoveSkillType", [0.2, 0.3, 0.1, 0.0, 0.5, 1.0])
+        .await;
+    assert!(outcome.succeeded, "{}", outcome.message);
+    values.until("TcpPose", at(0.2)).await;
+    values
+        .until("SafetyMode", |value| *value == Ok(1.into()))
+        .await;
+    bench.simulator.set_protective_stop(true);
+    values
+        .until("SafetyMode", |value| *value == Ok(3.into()))
+        .await;
+    bench.simulator.set_silent(true);
+    values.until("SafetyMode", Result::is_err).await;
+    bench.simulator.set_silent(false);
+    values
+        .until("SafetyMode", |value| *value == Ok(3.into()))
+        .await;
+}
+
+#[tokio::test]
+async fn a_force_move_ends_at_a_contact_and_says_the_force() {
+    let bench = bench_at(1.0, Some(0.45)).await;
+    let run = async |z: f64| {
+        let mut parameters = to([0.4, 0.0, z, 0.0, 0.0, 0.0]);
+        parameters.push(("MaxForce".to_owned(), vec![0.0, 0.0, 20.0].into()));
+        parameters.push(("MaxVelocity".to_owned(), 0.05.into()));
+        let driver = bench.driver("ForceMoveSkillType");
+        conformance::run_once("ForceMoveSkillType", driver, parameters)
+            .await
+            .unwrap()
+    };
+    let result = |outcome: &Outcome, name: &str| {
+        let found = outcome.results.iter().find(|(known, _)| known == name);
+        found.unwrap().1.clone()
+    };
+    let free = run(0.47).await;
+    assert!(free.succeeded, "{}", free.message);
+    assert_eq!(result(&free, "ForceExceeded"), false.into());
+    let contact = run(0.3).await;
+    assert!(contact.succeeded, "{}", contact.message);
+    assert_eq!(result(&contact, "ForceExceeded"), true.into());
+    let force = result(&contact, "Force").as_f64s().unwrap();
+    assert!(force[2] > 20.0, "{force:?}");
+    let position = result(&contact, "Position").as_f64s().unwrap();
+    assert!((0.3..0.446).contains(&position[2]), "{position:?}");
+    let [_, _, z, ..] = bench.simulator.pose();
+    assert!(z > 0.31, "it stands at {z}");
 }

@@ -2,15 +2,17 @@
 
 use std::fmt::Debug;
 use std::sync::Arc;
+use std::time::Duration;
 
 use async_trait::async_trait;
 use tokio::sync::watch;
 
-use super::DriverFault;
+use super::{DriverFault, SensorRead};
 use crate::client::{PeerAccess, ToolState};
 use crate::driver::Driver;
 use crate::parameters::TypeName;
-use crate::yaml::{Node, Reader};
+use crate::values::{DeviceValue, LiveValue, Measured, Sensor, ValueFacts, watch as watch_sensor};
+use crate::yaml::{Code, Node, Reader};
 
 /// A device. Its drivers share the connection to it.
 #[async_trait]
@@ -36,6 +38,17 @@ pub trait Device: Debug + Send + Sync {
         None
     }
 
+    /// Returns the values that the device measures.
+    fn values(&self) -> &'static [DeviceValue] {
+        &[]
+    }
+
+    /// Measures the values of the device until an error occurs, as [`Sensor::measure`].
+    async fn measure(&self, period: Duration, out: &Measured) -> String {
+        let _unused = (period, out);
+        std::future::pending().await
+    }
+
     /// Keeps the state of the device up to date while its component is served.
     async fn tend(&self, peers: &PeerAccess) {
         let _unused = peers;
@@ -48,6 +61,36 @@ pub trait DeviceKinds {
     /// Reads the value of the key `device`. Returns `None` after an error, which is added to the
     /// findings.
     fn read(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>;
+
+    /// Reads the driver `http` of a skill. Returns `None` after an error, which is added to the
+    /// findings.
+    fn http(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Driver>> {
+        let message = "this program knows no `http`".to_owned();
+        reader.refuse(node, Code::Driver, message)
+    }
+
+    /// Reads a source of values: the value of the key `kind` of an entry of `values`, which is
+    /// `modbus`, `io_link` or `http`. Returns `None` after an error, which is added to the
+    /// findings.
+    fn sensor(&self, kind: &str, node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+        let message = format!("this program knows no `{kind}`");
+        reader.refuse(node, Code::Source, message)
+    }
+}
+
+/// The values of a device, as a sensor.
+#[derive(Debug)]
+pub(crate) struct DeviceSensor(pub(crate) Arc<dyn Device>);
+
+#[async_trait]
+impl Sensor for DeviceSensor {
+    async fn measure(&self, period: Duration, out: &Measured) -> String {
+        self.0.measure(period, out).await
+    }
+
+    fn source(&self) -> String {
+        "the device".to_owned()
+    }
 }
 
 /// Supports no kind of device.
@@ -57,6 +100,33 @@ pub struct NoDevices;
 impl DeviceKinds for NoDevices {
     fn read(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
         let message = "this program knows no devices".to_owned();
-        reader.refuse(node, crate::yaml::Code::Driver, message)
+        reader.refuse(node, Code::Driver, message)
     }
+}
+
+/// Measures all values of a device as long as the returned future is polled.
+pub fn measure_device(
+    device: Arc<dyn Device>,
+    period: Duration,
+) -> (Vec<LiveValue>, impl Future<Output = ()> + Send) {
+    let mut measured = Measured::default();
+    let live = device.values().iter().map(|value| {
+        let facts = ValueFacts {
+            name: value.name.to_owned(),
+            shape: value.shape,
+            unit: value.unit.map(str::to_owned),
+            range: value.range,
+            about: value.about.to_owned(),
+        };
+        measured.add(value.name, &Arc::new(facts))
+    });
+    let live = live.collect();
+    (
+        live,
+        watch_sensor(
+            Arc::new(DeviceSensor(device)),
+            watch::Sender::new(period).subscribe(),
+            measured,
+        ),
+    )
 }

@@ -9,15 +9,21 @@ use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
 use plant_opcua::users::{Role, Roles};
 
+use super::configurable::read_configurable;
+use super::values::{Around, read_values};
 use super::world::{read_grip_point, read_numbers, read_world};
 use super::{
     Asked, Component, DeviceKinds, DriverSetup, ExecWork, LEASE, Lds, MOST_SKILLS, NoDevices,
-    Partner, Partners, Robot, Security, Simulation, SkillSetup, anonymous_by_default,
+    Partner, Partners, Robot, Security, Simulation, SkillSetup, ValueSetup, anonymous_by_default,
 };
+use crate::configuration::Configurable;
 use crate::parameters::{TypeName, shortened};
 use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
 
 impl Component {
+    /// The JSON schema of the YAML.
+    pub const SCHEMA: &str = include_str!("component.schema.json");
+
     /// Reads a component from YAML; paths are relative to `folder`. All errors are reported
     /// together.
     ///
@@ -53,7 +59,7 @@ impl Component {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 17] = [
+const KEYS: [&str; 19] = [
     "component",
     "application_uri",
     "namespace",
@@ -70,7 +76,19 @@ const KEYS: [&str; 17] = [
     "robot",
     "world",
     "power_off",
+    "values",
+    "configurable",
     "skills",
+];
+
+/// Keys of a skill.
+const SKILL_KEYS: [&str; 6] = [
+    "name",
+    "type",
+    "driver",
+    "capabilities",
+    "timeout",
+    "grip_point",
 ];
 
 fn component(
@@ -96,6 +114,8 @@ fn component(
         robot,
         world,
         power_off,
+        values,
+        configurable,
         skills,
     ] = reader.map(root, KEYS)?;
     // All values are read, so that all errors are reported.
@@ -130,9 +150,12 @@ fn component(
     let robot = robot.map(|node| read_robot(node, reader));
     let power_off = power_off.map_or(Some(false), |node| reader.boolean(node));
     let world = world.map_or_else(BTreeMap::new, |node| read_world(node, reader));
-    let skills = reader
-        .needed(skills, "skills", root.place)
-        .map(|node| read_skills(node, folder, reader));
+    let around = Around {
+        folder,
+        kinds,
+        device: device.as_ref().and_then(Option::as_ref),
+    };
+    let parts = read_parts(root, [skills, values, configurable], &around, reader);
     Some(Component {
         name: name?,
         application_uri: uri?,
@@ -150,12 +173,47 @@ fn component(
         robot: whole(robot)?,
         power_off: power_off?,
         world: Arc::new(world),
-        skills: skills?,
+        values: parts.values,
+        configurable: parts.configurable,
+        skills: parts.skills?,
     })
 }
 
+/// The skills, the values and the configuration of a component.
+struct Parts {
+    /// `None` after a finding.
+    skills: Option<Vec<SkillSetup>>,
+    values: Vec<ValueSetup>,
+    configurable: Vec<Configurable>,
+}
+
+fn read_parts(
+    root: &Node,
+    [skills, values, configurable]: [Option<&Node>; 3],
+    around: &Around<'_>,
+    reader: &mut Reader<'_>,
+) -> Parts {
+    // A sensor has values and no skills.
+    let skills = match (skills, values) {
+        (None, Some(_)) => Some(Vec::new()),
+        (skills, _) => reader
+            .needed(skills, "skills", root.place)
+            .map(|node| read_skills(node, (around.folder, around.kinds), reader)),
+    };
+    let known = skills.as_deref().unwrap_or_default();
+    let values = values.map_or_else(Vec::new, |node| read_values(node, (around, known), reader));
+    let configurable = configurable.map_or_else(Vec::new, |node| {
+        read_configurable(node, (known, &values), reader)
+    });
+    Parts {
+        skills,
+        values,
+        configurable,
+    }
+}
+
 /// Returns the value of an optional key; `None` if the value is invalid.
-fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
+pub(super) fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
     match read {
         Some(read) => read.map(Some),
         None => Some(None),
@@ -332,7 +390,7 @@ fn read_lds(node: &Node, reader: &mut Reader<'_>) -> Option<Lds> {
     }
 }
 
-fn read_name(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+pub(super) fn read_name(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
     let text = reader.text(node, "a name")?;
     let fits = !text.is_empty()
         && text.len() <= LONGEST_NAME
@@ -431,7 +489,10 @@ fn read_security(node: &Node, reader: &mut Reader<'_>) -> Vec<Security> {
     policies
 }
 
-fn read_skills(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
+/// The folder of the document, and the kinds of devices.
+type Surroundings<'a> = (&'a Path, &'a dyn DeviceKinds);
+
+fn read_skills(node: &Node, around: Surroundings<'_>, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
     let nodes = reader.list(node);
     if nodes.is_empty() || nodes.len() > MOST_SKILLS {
         let message = format!(
@@ -442,7 +503,7 @@ fn read_skills(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Vec<Skill
     }
     let mut skills: Vec<SkillSetup> = Vec::new();
     for node in nodes.iter().take(MOST_SKILLS) {
-        let Some((skill, name_at)) = read_skill(node, folder, reader) else {
+        let Some((skill, name_at)) = read_skill(node, around, reader) else {
             continue;
         };
         // Names are compared without case, because people do not distinguish them by case.
@@ -458,16 +519,13 @@ fn read_skills(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Vec<Skill
     skills
 }
 
-fn read_skill(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<(SkillSetup, Place)> {
-    let keys = [
-        "name",
-        "type",
-        "driver",
-        "capabilities",
-        "timeout",
-        "grip_point",
-    ];
-    let [name, skill_type, driver, capabilities, timeout, grip_point] = reader.map(node, keys)?;
+fn read_skill(
+    node: &Node,
+    around: Surroundings<'_>,
+    reader: &mut Reader<'_>,
+) -> Option<(SkillSetup, Place)> {
+    let [name, skill_type, driver, capabilities, timeout, grip_point] =
+        reader.map(node, SKILL_KEYS)?;
     let name_at = name.map_or(node.place, |name| name.place);
     let place = skill_type.map_or(node.place, |skill_type| skill_type.place);
     let name = reader
@@ -478,7 +536,7 @@ fn read_skill(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<(Sk
         .and_then(|node| read_type(node, reader));
     let driver = reader
         .needed(driver, "driver", node.place)
-        .and_then(|node| read_driver(node, folder, reader));
+        .and_then(|node| read_driver(node, around, reader));
     let capabilities = capabilities
         .map(|node| reader.list(node))
         .unwrap_or_default()
@@ -510,7 +568,11 @@ fn read_type(node: &Node, reader: &mut Reader<'_>) -> Option<TypeName> {
     }
 }
 
-fn read_driver(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<DriverSetup> {
+fn read_driver(
+    node: &Node,
+    (folder, kinds): Surroundings<'_>,
+    reader: &mut Reader<'_>,
+) -> Option<DriverSetup> {
     if matches!(&node.kind, Kind::Scalar(text) if text == "simulated") {
         return Some(DriverSetup::Simulated(Simulation::default()));
     }
@@ -525,25 +587,35 @@ fn read_driver(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Dr
             within: USUALLY_WITHIN,
         }));
     }
-    let keys = ["simulated", "pick_and_place", "call", "action", "exec"];
+    let keys = [
+        "simulated",
+        "pick_and_place",
+        "call",
+        "action",
+        "exec",
+        "http",
+    ];
     let space = |asked, node, reader: &mut Reader<'_>| {
         let work = super::space::read(asked, node, reader);
         work.map(|work| DriverSetup::Space(Box::new(work)))
     };
     match reader.map(node, keys)? {
-        [Some(node), None, None, None, None] => {
+        [Some(node), None, None, None, None, None] => {
             read_simulation(node, reader).map(DriverSetup::Simulated)
         }
-        [None, Some(node), None, None, None] => {
+        [None, Some(node), None, None, None, None] => {
             read_partners(node, reader).map(DriverSetup::PickAndPlace)
         }
-        [None, None, Some(node), None, None] => space(Asked::Call, node, reader),
-        [None, None, None, Some(node), None] => space(Asked::Action, node, reader),
-        [None, None, None, None, Some(node)] => {
+        [None, None, Some(node), None, None, None] => space(Asked::Call, node, reader),
+        [None, None, None, Some(node), None, None] => space(Asked::Action, node, reader),
+        [None, None, None, None, Some(node), None] => {
             read_exec(node, folder, reader).map(|work| DriverSetup::Exec(Box::new(work)))
         }
+        [None, None, None, None, None, Some(node)] => {
+            kinds.http(node, reader).map(DriverSetup::Given)
+        }
         _ => {
-            let message = "a driver is exactly one of `simulated`, `device`, `pick_and_place`, `call`, `action` and `exec`";
+            let message = "a driver is exactly one of `simulated`, `device`, `pick_and_place`, `call`, `action`, `exec` and `http`";
             reader.findings().error(Code::Driver, node.place, message);
             None
         }
@@ -571,7 +643,7 @@ fn read_exec(node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Exec
 }
 
 /// Reads a program and its arguments.
-fn read_command(node: &Node, reader: &mut Reader<'_>) -> Option<Vec<String>> {
+pub(super) fn read_command(node: &Node, reader: &mut Reader<'_>) -> Option<Vec<String>> {
     let nodes = reader.list(node);
     let words: Vec<String> = nodes
         .iter()
@@ -670,6 +742,36 @@ mod tests {
         assert_eq!(names, ["Grasp", "Release"]);
         assert!(
             matches!(&component.skills[0].driver, DriverSetup::Simulated(how) if how.duration == Some(Duration::from_millis(400)))
+        );
+    }
+
+    #[test]
+    fn the_schema_has_the_keys_that_are_read() {
+        let schema: serde_json::Value = serde_json::from_str(Component::SCHEMA).unwrap();
+        let keys = |of: &serde_json::Value| {
+            let mut keys: Vec<String> = of["properties"]
+                .as_object()
+                .unwrap()
+                .keys()
+                .cloned()
+                .collect();
+            keys.sort();
+            keys
+        };
+        let sorted = |keys: &[&str]| {
+            let mut keys: Vec<String> = keys.iter().map(|key| (*key).to_owned()).collect();
+            keys.sort();
+            keys
+        };
+        assert_eq!(keys(&schema), sorted(&KEYS));
+        assert_eq!(keys(&schema["$defs"]["skill"]), sorted(&SKILL_KEYS));
+        assert_eq!(
+            keys(&schema["$defs"]["value"]),
+            sorted(&super::super::values::KEYS)
+        );
+        assert_eq!(
+            keys(&schema["$defs"]["configurable"]),
+            sorted(&super::super::configurable::KEYS)
         );
     }
 

@@ -173,7 +173,7 @@ pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option
     })
 }
 
-fn read_topic(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+pub(super) fn read_topic(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
     let text = reader.text(node, "a name of the space")?;
     let number = |text: &str, low: u32, high: u32| {
         let plain = text == "0" || !text.starts_with('0');

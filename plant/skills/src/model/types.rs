@@ -3,61 +3,8 @@
 use program::Rest;
 
 use super::table::{Preset, SkillType, Unit, Variable};
+use super::units::{ACCELERATION, KILOGRAM, METRE, NEWTON, RADIAN, SPEED, TURNING, TURNING_UP};
 use crate::value::{Builtin, Shape};
-
-const NEWTON: Unit = Unit {
-    symbol: "N",
-    name: "newton",
-    id: code(b"NEW"),
-};
-const METRE: Unit = Unit {
-    symbol: "m",
-    name: "metre",
-    id: code(b"MTR"),
-};
-const SPEED: Unit = Unit {
-    symbol: "m/s",
-    name: "metre per second",
-    id: code(b"MTS"),
-};
-const ACCELERATION: Unit = Unit {
-    symbol: "m/s\u{b2}",
-    name: "metre per second squared",
-    id: code(b"MSK"),
-};
-
-const KILOGRAM: Unit = Unit {
-    symbol: "kg",
-    name: "kilogram",
-    id: code(b"KGM"),
-};
-
-const RADIAN: Unit = Unit {
-    symbol: "rad",
-    name: "radian",
-    id: code(b"C81"),
-};
-const TURNING: Unit = Unit {
-    symbol: "rad/s",
-    name: "radian per second",
-    id: code(b"2A"),
-};
-const TURNING_UP: Unit = Unit {
-    symbol: "rad/s\u{b2}",
-    name: "radian per second squared",
-    id: code(b"2B"),
-};
-
-/// Converts a UNECE code of two or three characters to its number.
-const fn code(characters: &[u8]) -> u32 {
-    let mut code = 0;
-    let mut rest = characters;
-    while let [first, others @ ..] = rest {
-        code = (code << 8) | *first as u32;
-        rest = others;
-    }
-    code
-}
 
 const fn number(
     name: &'static str,

@@ -341,7 +341,7 @@ fn transition_ref(transition: &Transition) -> StateRef {
     }
 }
 
-fn date_time(time: SystemTime) -> DateTime {
+pub(super) fn date_time(time: SystemTime) -> DateTime {
     let since = time
         .duration_since(SystemTime::UNIX_EPOCH)
         .unwrap_or_default();

@@ -40,7 +40,7 @@ codes! {
     WrongValue = "P005", "The value is not what its key takes: a list, a map, a number of a range, or one of a few words.";
     MissingKey = "P006", "A key that has no default is not there.";
     Name = "P010", "A name has letters, digits, - and _ only, at most 64 of them: it stands in the names of the space.";
-    NameTwice = "P011", "Two skills of a component have one name.";
+    NameTwice = "P011", "Two skills or two values of a component have one name.";
     Uri = "P012", "A URI has a scheme, as urn:example:gripper or https://example.com/grasp, and no blanks.";
     Namespace = "P013", "The namespace is the number of the component in the space of the cell, from 1 to 65535, and of no other program.";
     Endpoint = "P014", "An endpoint is opc.tcp://<host>:<port>[/path].";
@@ -49,8 +49,9 @@ codes! {
     SkillType = "P020", "A skill type is one of urn:ua-bridge:skills by its name, or nsu=<namespace uri>;<BrowseName> of one that a NodeSet brings, and a subtype of SkillType.";
     AbstractType = "P021", "An abstract type has no skills of its own, only its subtypes have.";
     Driver = "P022", "Who does the work of a skill: `simulated` for grippers and robots, `device` for what `device` of the component names, `pick_and_place` for PickAndPlaceSkillType, `call` and `action` for what others in the space do.";
-    TooMany = "P023", "A component has from 1 to 99 skills.";
+    TooMany = "P023", "A component has from 1 to 1000 skills, and at most 89 values. A component with values needs no skills.";
     Capability = "P024", "A capability is the IRI of its class in the plant's knowledge.";
+    Source = "P025", "A value has one source: `device` with the name of a value of the component's device, `modbus`, `io_link`, `http`, `topic` for a topic of the space, `exec` for a program, or the runs of a skill as `runs`, `failures`, `mean_duration` or `availability`.";
 }
 
 impl fmt::Display for Code {
@@ -181,6 +182,12 @@ impl Findings {
             .iter()
             .map(|finding| finding.render(file, source) + "\n")
             .collect()
+    }
+}
+
+impl Extend<Finding> for Findings {
+    fn extend<I: IntoIterator<Item = Finding>>(&mut self, findings: I) {
+        findings.into_iter().for_each(|finding| self.push(finding));
     }
 }
 

@@ -1,0 +1,140 @@
+//! HTTP/1.1 client of devices: one connection per request, responses bounded in time and size.
+
+use std::fmt;
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::{BodyExt as _, Full, Limited};
+use hyper::header::{CONTENT_TYPE, HOST};
+use hyper::{Request, Response, body::Incoming};
+use hyper_util::rt::TokioIo;
+use serde_json::Value;
+use tokio::task::JoinSet;
+use tokio::time::{Instant, timeout_at};
+
+use crate::modbus::connected;
+
+/// The server of a device, by its host and port.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Host(pub(crate) String);
+
+impl fmt::Display for Host {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "http://{}", self.0)
+    }
+}
+
+/// A request.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Asked<'a> {
+    pub(crate) method: &'a str,
+    /// The path with its query.
+    pub(crate) path: &'a str,
+    pub(crate) body: Option<&'a Value>,
+    /// Time limit for the connection and the response.
+    pub(crate) within: Duration,
+}
+
+/// A request without a usable response.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Fault {
+    /// There is no connection: the request was not sent.
+    Unreachable(String),
+    /// The request was sent, and the response is missing or damaged.
+    Lost(String),
+    /// The device has responded with a status that is not a success.
+    Refused {
+        /// The status code.
+        status: u16,
+        /// The description with the message of the device.
+        why: String,
+    },
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Unreachable(why) | Self::Lost(why) | Self::Refused { why, .. } => {
+                f.write_str(why)
+            }
+        }
+    }
+}
+
+impl Host {
+    /// Sends a request and returns its response; null for a response without a body.
+    ///
+    /// # Errors
+    /// A [`Fault`], which says whether the request may have been executed.
+    pub(crate) async fn ask(&self, asked: Asked<'_>) -> Result<Value, Fault> {
+        let until = Instant::now() + asked.within;
+        let late = || {
+            let within = asked.within.as_millis();
+            format!("no answer from {self} within {within} ms")
+        };
+        let unreachable = |error: &dyn fmt::Display| {
+            Fault::Unreachable(format!("{self} cannot be reached: {error}"))
+        };
+        let connecting = async {
+            let stream = connected(&self.0)
+                .await
+                .map_err(|error| unreachable(&error))?;
+            hyper::client::conn::http1::handshake(TokioIo::new(stream))
+                .await
+                .map_err(|error| unreachable(&error))
+        };
+        let (mut send, connection) = timeout_at(until, connecting)
+            .await
+            .map_err(|_| Fault::Unreachable(late()))??;
+        // Ends with this request.
+        let mut driving = JoinSet::new();
+        driving.spawn(connection);
+        let body = asked.body.map(Value::to_string).unwrap_or_default();
+        let request = Request::builder()
+            .method(asked.method)
+            .uri(asked.path)
+            .header(HOST, &self.0)
+            .header(CONTENT_TYPE, "application/json")
+            .body(Full::new(Bytes::from(body)))
+            .map_err(|error| {
+                Fault::Unreachable(format!("{} cannot be asked for: {error}", asked.path))
+            })?;
+        let answering = async {
+            let answer = send.send_request(request).await;
+            self.read(answer.map_err(|error| self.damaged(&error))?)
+                .await
+        };
+        timeout_at(until, answering)
+            .await
+            .map_err(|_| Fault::Lost(late()))?
+    }
+
+    async fn read(&self, answer: Response<Incoming>) -> Result<Value, Fault> {
+        let status = answer.status();
+        let body = Limited::new(answer.into_body(), LONGEST).collect().await;
+        let body = body.map_err(|error| self.damaged(&error))?;
+        let bytes = body.to_bytes();
+        let json = serde_json::from_slice::<Value>(&bytes);
+        if !status.is_success() {
+            let message = json.ok().and_then(|json| {
+                let message = json.get("message")?.as_str()?;
+                Some(message.chars().take(120).collect::<String>())
+            });
+            let message = message.unwrap_or_default();
+            return Err(Fault::Refused {
+                status: status.as_u16(),
+                why: format!("{self} refuses with {status}: {message}"),
+            });
+        }
+        if bytes.is_empty() {
+            return Ok(Value::Null);
+        }
+        json.map_err(|error| self.damaged(&error))
+    }
+
+    fn damaged(&self, error: &dyn fmt::Display) -> Fault {
+        Fault::Lost(format!("the answer of {self} is damaged: {error}"))
+    }
+}
+
+const LONGEST: usize = 64 * 1024;

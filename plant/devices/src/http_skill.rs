@@ -1,0 +1,611 @@
+//! Skills and values of devices with an HTTP interface of their own: the YAML has the requests, and
+//! where the state and the results are in the responses.
+//!
+//! A request that was sent and has no usable response may have been executed. Then the state of the
+//! machine is unknown: the `stop` request is sent, and the skill needs a Reset.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use serde_json::{Map, Value as Json};
+use skills::yaml::{Code, Kind, Node, Reader};
+use skills::{
+    Builtin, Driver, Measured, Parameters, Results, Sensor, SensorRead, Shape, Value, Work,
+};
+use tokio::time::{Instant, sleep, sleep_until};
+
+use crate::http::{Asked, Fault, Host};
+use crate::sensors::ticks;
+
+/// A request of the YAML.
+#[derive(Debug, Clone, PartialEq)]
+struct Template {
+    method: String,
+    host: Host,
+    /// The path, in which `{Name}` is a parameter.
+    path: String,
+    /// The body. A text `{Name}` is the value of a parameter.
+    body: Option<Json>,
+}
+
+/// A value at a JSON pointer (RFC 6901) and the values that it is compared with.
+#[derive(Debug, Clone, PartialEq)]
+struct Condition {
+    pointer: String,
+    values: Vec<String>,
+}
+
+impl Condition {
+    fn holds(&self, answer: &Json) -> bool {
+        let Some(found) = answer.pointer(&self.pointer) else {
+            return false;
+        };
+        let text = found
+            .as_str()
+            .map_or_else(|| found.to_string(), str::to_owned);
+        self.values.contains(&text)
+    }
+}
+
+/// The polling of the state of a run.
+#[derive(Debug, Clone, PartialEq)]
+struct Poll {
+    request: Template,
+    every: Duration,
+    done: Condition,
+    failed: Option<Condition>,
+    progress: Option<String>,
+    step: Option<String>,
+    reason: Option<String>,
+}
+
+/// The driver of a skill.
+#[derive(Debug, PartialEq)]
+struct HttpSkill {
+    start: Template,
+    poll: Option<Poll>,
+    /// The pointers of results by their names.
+    results: BTreeMap<String, String>,
+    stop: Option<Template>,
+    /// Time limit of each response.
+    within: Duration,
+    halt_timeout: Duration,
+}
+
+/// The end of the work at the device.
+enum Ended {
+    Done(Json),
+    Failed(String),
+    Unknown(String),
+}
+
+#[async_trait]
+impl Driver for HttpSkill {
+    /// Halt waits for the end of the work, and for the response to the `stop` request.
+    fn halt_timeout(&self) -> Option<Duration> {
+        Some(self.halt_timeout + self.within + self.within)
+    }
+
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        let all = [Some(&self.start), self.poll.as_ref().map(|of| &of.request)];
+        for template in all.into_iter().flatten() {
+            template.filled(parameters)?;
+        }
+        Ok(())
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        work.step("Start").await;
+        let ended = self.work(&work).await;
+        match ended {
+            Ended::Done(answer) => self.outcome(&answer),
+            Ended::Failed(why) => Err(why),
+            Ended::Unknown(why) => {
+                let stopped = match self.stop(work.parameters()).await {
+                    None => "there is no `stop` request".to_owned(),
+                    Some(Ok(())) => "the `stop` request is done".to_owned(),
+                    Some(Err(fault)) => format!("the `stop` request has failed: {fault}"),
+                };
+                let why = format!("{why}; {stopped}");
+                work.unknown(&why).await;
+                Err(why)
+            }
+        }
+    }
+}
+
+impl HttpSkill {
+    async fn work(&self, work: &Work) -> Ended {
+        let starting = self.start.send(work.parameters(), self.within);
+        tokio::pin!(starting);
+        let started = tokio::select! {
+            started = &mut starting => started,
+            () = work.stopped() => {
+                work.pending("the device has not answered the start yet").await;
+                // With polling, the stop follows the response: the device could start the work
+                // after a stop that comes too early.
+                if self.poll.is_none() && let Some(Err(fault)) = self.stop(work.parameters()).await {
+                    return Ended::Unknown(fault.to_string());
+                }
+                starting.await
+            }
+        };
+        let answer = match started {
+            Ok(answer) => answer,
+            Err(fault @ Fault::Unreachable(_)) => return Ended::Failed(fault.to_string()),
+            // The status of a request that was not accepted.
+            Err(Fault::Refused { status, why }) if (400..500).contains(&status) => {
+                return Ended::Failed(why);
+            }
+            Err(fault) => return Ended::Unknown(fault.to_string()),
+        };
+        match &self.poll {
+            None => Ended::Done(answer),
+            Some(poll) => self.follow(poll, work).await,
+        }
+    }
+
+    /// Polls the state until the work has ended.
+    async fn follow(&self, poll: &Poll, work: &Work) -> Ended {
+        work.step("Run").await;
+        let mut answered = Instant::now();
+        let mut until = None;
+        let mut step = None;
+        loop {
+            tokio::select! {
+                () = sleep(poll.every) => {}
+                () = work.stopped(), if until.is_none() => {
+                    until = Some(Instant::now() + self.halt_timeout);
+                    work.pending("the device is asked to stop").await;
+                    match self.stop(work.parameters()).await {
+                        Some(Ok(())) => {}
+                        Some(Err(fault)) => return Ended::Unknown(fault.to_string()),
+                        None => {
+                            let why = "the YAML has no `stop` request: the work goes on";
+                            work.cancel_refused(why).await;
+                        }
+                    }
+                }
+                () = at(until) => {
+                    let limit = self.halt_timeout;
+                    return Ended::Unknown(format!("the work has not ended within {limit:?} after Halt"));
+                }
+            }
+            let answer = match poll.request.send(work.parameters(), self.within).await {
+                Ok(answer) => answer,
+                Err(fault) if answered.elapsed() > LONGEST_SILENCE => {
+                    return Ended::Unknown(format!("the state is unknown: {fault}"));
+                }
+                Err(_) => continue,
+            };
+            answered = Instant::now();
+            let text = |pointer: &Option<String>| {
+                let found = answer.pointer(pointer.as_ref()?)?;
+                let text = found.as_str();
+                Some(text.map_or_else(|| found.to_string(), str::to_owned))
+            };
+            if poll.done.holds(&answer) {
+                return Ended::Done(answer);
+            }
+            if poll.failed.as_ref().is_some_and(|of| of.holds(&answer)) {
+                let why = text(&poll.reason).filter(|why| !why.is_empty());
+                let why = why.unwrap_or_else(|| "the device reports a failure".to_owned());
+                return Ended::Failed(why.chars().take(LONGEST_REASON).collect());
+            }
+            let progress = poll.progress.as_ref();
+            let progress = progress.and_then(|pointer| answer.pointer(pointer)?.as_f64());
+            if let Some(progress) = progress {
+                #[expect(clippy::cast_possible_truncation, reason = "a fraction from 0 to 1")]
+                work.progress(progress.clamp(0.0, 1.0) as f32);
+            }
+            let now = text(&poll.step);
+            if now.is_some() && now != step {
+                let shown: String = now.iter().flat_map(|now| now.chars()).take(80).collect();
+                work.step(shown).await;
+                step = now;
+            }
+        }
+    }
+
+    /// Sends the `stop` request; `None` if there is none.
+    async fn stop(&self, parameters: &Parameters) -> Option<Result<(), Fault>> {
+        let stop = self.stop.as_ref()?;
+        Some(stop.send(parameters, self.within).await.map(drop))
+    }
+
+    fn outcome(&self, answer: &Json) -> Result<Results, String> {
+        let results = self.results.iter().map(|(name, pointer)| {
+            let found = answer.pointer(pointer);
+            let found = found.ok_or_else(|| format!("{name}: the response has no {pointer}"))?;
+            let value = Value::of_json(found);
+            let value = value.ok_or_else(|| format!("{name}: {pointer} has a wrong type"))?;
+            Ok((name.clone(), value))
+        });
+        results.collect()
+    }
+}
+
+async fn at(until: Option<Instant>) {
+    match until {
+        Some(until) => sleep_until(until).await,
+        None => std::future::pending().await,
+    }
+}
+
+impl Template {
+    async fn send(&self, parameters: &Parameters, within: Duration) -> Result<Json, Fault> {
+        let (path, body) = self.filled(parameters).map_err(Fault::Unreachable)?;
+        let asked = Asked {
+            method: &self.method,
+            path: &path,
+            body: body.as_ref(),
+            within,
+        };
+        self.host.ask(asked).await
+    }
+
+    /// Returns the path and the body with the values of parameters.
+    ///
+    /// # Errors
+    /// The name of an unknown parameter.
+    fn filled(&self, parameters: &Parameters) -> Result<(String, Option<Json>), String> {
+        let value = |name: &str| {
+            let value = parameters.get(name).map(Value::to_json);
+            value.ok_or_else(|| format!("{name} is not a parameter of the skill"))
+        };
+        let path = fill(&self.path, &|name| Ok(escaped(&plain(&value(name)?))))?;
+        let body = self.body.as_ref().map(|body| filled(body, &value));
+        Ok((path, body.transpose()?))
+    }
+}
+
+/// Replaces each `{Name}` of a text.
+fn fill(text: &str, value: &dyn Fn(&str) -> Result<String, String>) -> Result<String, String> {
+    let mut out = String::new();
+    let mut rest = text;
+    while let Some((before, after)) = rest.split_once('{') {
+        out.push_str(before);
+        match after.split_once('}') {
+            Some((name, after)) if is_name(name) => {
+                out.push_str(&value(name)?);
+                rest = after;
+            }
+            _ => {
+                out.push('{');
+                rest = after;
+            }
+        }
+    }
+    out.push_str(rest);
+    Ok(out)
+}
+
+fn filled(json: &Json, value: &dyn Fn(&str) -> Result<Json, String>) -> Result<Json, String> {
+    Ok(match json {
+        Json::String(text) => {
+            let whole = text.strip_prefix('{').and_then(|of| of.strip_suffix('}'));
+            match whole.filter(|name| is_name(name)) {
+                Some(name) => value(name)?,
+                None => fill(text, &|name| Ok(plain(&value(name)?)))?.into(),
+            }
+        }
+        Json::Array(elements) => {
+            let elements = elements.iter().map(|element| filled(element, value));
+            Json::Array(elements.collect::<Result<_, _>>()?)
+        }
+        Json::Object(entries) => {
+            let entries = entries
+                .iter()
+                .map(|(key, json)| Ok((key.clone(), filled(json, value)?)));
+            Json::Object(entries.collect::<Result<Map<_, _>, String>>()?)
+        }
+        Json::Null | Json::Bool(_) | Json::Number(_) => json.clone(),
+    })
+}
+
+fn is_name(text: &str) -> bool {
+    !text.is_empty() && text.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
+}
+
+/// Returns a text without quotes, and other values as JSON.
+fn plain(json: &Json) -> String {
+    json.as_str()
+        .map_or_else(|| json.to_string(), str::to_owned)
+}
+
+/// Escapes the bytes that a part of a path or query must not contain (RFC 3986, 2.3).
+fn escaped(text: &str) -> String {
+    let escape = |byte: u8| match byte {
+        b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
+            char::from(byte).to_string()
+        }
+        _ => format!("%{byte:02X}"),
+    };
+    text.bytes().map(escape).collect()
+}
+
+/// A value that is polled.
+#[derive(Debug)]
+struct HttpValue {
+    request: Template,
+    pointer: String,
+    within: Duration,
+}
+
+#[async_trait]
+impl Sensor for HttpValue {
+    async fn measure(&self, period: Duration, out: &Measured) -> String {
+        let mut ticks = ticks(period);
+        loop {
+            ticks.tick().await;
+            let Template {
+                method, host, path, ..
+            } = &self.request;
+            let asked = Asked {
+                method,
+                path,
+                body: None,
+                within: self.within,
+            };
+            let answer = match host.ask(asked).await {
+                Ok(answer) => answer,
+                Err(fault) => return fault.to_string(),
+            };
+            match answer.pointer(&self.pointer) {
+                Some(found) => out.put_single_json(found),
+                None => {
+                    let why = format!("the response of {host} has no {}", self.pointer);
+                    out.put_single(Err(why));
+                }
+            }
+        }
+    }
+
+    fn source(&self) -> String {
+        format!("{}{}", self.request.host, self.request.path)
+    }
+
+    fn within(&self, period: Duration) -> Duration {
+        (period * 10).max(self.within + self.within)
+    }
+}
+
+/// Reads the value of the key `http` of a driver.
+pub(crate) fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Driver>> {
+    let keys = ["start", "poll", "results", "stop", "within", "halt_timeout"];
+    let [start, poll, results, stop, within, halt_timeout] = reader.map(node, keys)?;
+    let start = reader
+        .needed(start, "start", node.place)
+        .and_then(|node| read_template(node, "POST", reader));
+    let poll = poll.map(|node| read_poll(node, reader));
+    let results = results.map_or_else(|| Some(BTreeMap::new()), |node| read_results(node, reader));
+    let stop = stop.map(|node| read_template(node, "POST", reader));
+    let within = within.map_or(Some(WITHIN), |node| reader.duration(node));
+    let halt_timeout = halt_timeout.map_or(Some(HALT), |node| reader.duration(node));
+    Some(Arc::new(HttpSkill {
+        start: start?,
+        poll: whole(poll)?,
+        results: results?,
+        stop: whole(stop)?,
+        within: within?,
+        halt_timeout: halt_timeout?,
+    }))
+}
+
+/// Reads the source `http` of a value.
+pub(crate) fn read_value(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
+    let [url, pointer, within] = reader.map(node, ["url", "pointer", "within"])?;
+    let url = reader
+        .needed(url, "url", node.place)
+        .and_then(|node| read_url(node, reader));
+    let pointer = match pointer {
+        Some(node) => read_pointer(node, reader),
+        None => Some(String::new()),
+    };
+    let within = within.map_or(Some(WITHIN), |node| reader.duration(node));
+    let (host, path) = url?;
+    let sensor = HttpValue {
+        request: Template {
+            method: "GET".to_owned(),
+            host,
+            path,
+            body: None,
+        },
+        pointer: pointer?,
+        within: within?,
+    };
+    Some(SensorRead {
+        sensor: Arc::new(sensor),
+        shape: Shape::scalar(Builtin::Double),
+    })
+}
+
+fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
+    match read {
+        Some(read) => read.map(Some),
+        None => Some(None),
+    }
+}
+
+fn read_template(node: &Node, usual: &str, reader: &mut Reader<'_>) -> Option<Template> {
+    let [method, url, body] = match &node.kind {
+        Kind::Scalar(_) => [None, Some(node), None],
+        Kind::Null | Kind::List(_) | Kind::Map(_) => reader.map(node, ["method", "url", "body"])?,
+    };
+    let method = match method {
+        None => Some(usual.to_owned()),
+        Some(node) => {
+            let text = reader.text(node, "GET, POST, PUT, PATCH or DELETE")?;
+            let known = ["GET", "POST", "PUT", "PATCH", "DELETE"].contains(&text);
+            known.then(|| text.to_owned()).or_else(|| {
+                let message = format!("expected GET, POST, PUT, PATCH or DELETE, found `{text}`");
+                reader.refuse(node, Code::WrongValue, message)
+            })
+        }
+    };
+    let url = reader
+        .needed(url, "url", node.place)
+        .and_then(|node| read_url(node, reader));
+    let (host, path) = url?;
+    Some(Template {
+        method: method?,
+        host,
+        path,
+        body: body.map(to_json),
+    })
+}
+
+/// Reads `http://host[:port]/path`.
+fn read_url(node: &Node, reader: &mut Reader<'_>) -> Option<(Host, String)> {
+    let text = reader.text(node, "a URL, as http://10.0.0.9/api/state")?;
+    let wrong = |reader: &mut Reader<'_>| {
+        let message = format!("expected http://host[:port]/path, found `{text}`");
+        reader.refuse(node, Code::WrongValue, message)
+    };
+    let Some(rest) = text.strip_prefix("http://") else {
+        return wrong(reader);
+    };
+    let (host, path) = match rest.find(['/', '?']) {
+        Some(at) => rest.split_at(at),
+        None => (rest, ""),
+    };
+    let address = match host.rsplit_once(':') {
+        Some((_, port)) if port.parse::<u16>().is_ok_and(|port| port > 0) => host.to_owned(),
+        Some(_) => return wrong(reader),
+        None => format!("{host}:80"),
+    };
+    let clean = |text: &str| {
+        text.bytes()
+            .all(|b| b.is_ascii_graphic() && !b"\"<>\\^`|#".contains(&b))
+    };
+    if host.starts_with(':') || host.is_empty() || host.contains(['@', '{']) || !clean(rest) {
+        return wrong(reader);
+    }
+    let path = match path.starts_with('/') {
+        true => path.to_owned(),
+        false => format!("/{path}"),
+    };
+    Some((Host(address), path))
+}
+
+/// Converts a tree to JSON. Scalars are numbers and Booleans as far as they are such.
+fn to_json(node: &Node) -> Json {
+    match &node.kind {
+        Kind::Null => Json::Null,
+        Kind::Scalar(text) => match serde_json::from_str(text) {
+            Ok(json @ (Json::Number(_) | Json::Bool(_))) => json,
+            Ok(_) | Err(_) => Json::from(text.as_str()),
+        },
+        Kind::List(nodes) => nodes.iter().map(to_json).collect(),
+        Kind::Map(pairs) => {
+            let entries = pairs.iter().filter_map(|(key, value)| {
+                let Kind::Scalar(key) = &key.kind else {
+                    return None;
+                };
+                Some((key.clone(), to_json(value)))
+            });
+            Json::Object(entries.collect())
+        }
+    }
+}
+
+fn read_poll(node: &Node, reader: &mut Reader<'_>) -> Option<Poll> {
+    let keys = [
+        "method", "url", "every", "done", "failed", "progress", "step", "reason",
+    ];
+    let [method, url, every, done, failed, progress, step, reason] = reader.map(node, keys)?;
+    let method = match method.map(|node| reader.text(node, "GET or POST")) {
+        None => Some("GET".to_owned()),
+        Some(Some(text @ ("GET" | "POST"))) => Some(text.to_owned()),
+        Some(_) => {
+            reader.wrong(node, "`method: GET` or `method: POST`");
+            None
+        }
+    };
+    let url = reader
+        .needed(url, "url", node.place)
+        .and_then(|node| read_url(node, reader));
+    let every = every.map_or(Some(POLL), |node| reader.duration(node));
+    let done = reader
+        .needed(done, "done", node.place)
+        .and_then(|node| read_condition(node, reader));
+    let failed = failed.map(|node| read_condition(node, reader));
+    let pointers = [progress, step, reason];
+    let [progress, step, reason] =
+        pointers.map(|node| whole(node.map(|node| read_pointer(node, reader))));
+    let (host, path) = url?;
+    Some(Poll {
+        request: Template {
+            method: method?,
+            host,
+            path,
+            body: None,
+        },
+        every: every?,
+        done: done?,
+        failed: whole(failed)?,
+        progress: progress?,
+        step: step?,
+        reason: reason?,
+    })
+}
+
+/// Reads `{/state: done}` or `{/state: [error, aborted]}`.
+fn read_condition(node: &Node, reader: &mut Reader<'_>) -> Option<Condition> {
+    let Kind::Map(pairs) = &node.kind else {
+        reader.wrong(node, "a map from a JSON pointer to values: {/state: done}");
+        return None;
+    };
+    let [(pointer, values)] = pairs.as_slice() else {
+        let message = "a condition has one JSON pointer: {/state: done}".to_owned();
+        return reader.refuse(node, Code::WrongValue, message);
+    };
+    let pointer = read_pointer(pointer, reader)?;
+    let values: Vec<String> = reader
+        .list(values)
+        .iter()
+        .filter_map(|node| reader.text(node, "a value").map(str::to_owned))
+        .collect();
+    Some(Condition { pointer, values })
+}
+
+fn read_results(node: &Node, reader: &mut Reader<'_>) -> Option<BTreeMap<String, String>> {
+    let Kind::Map(pairs) = &node.kind else {
+        reader.wrong(
+            node,
+            "a map from results to JSON pointers: {Gripped: /gripped}",
+        );
+        return None;
+    };
+    let mut results = BTreeMap::new();
+    for (key, value) in pairs {
+        let name = reader.text(key, "the name of a result")?.to_owned();
+        let pointer = read_pointer(value, reader)?;
+        results.insert(name, pointer);
+    }
+    Some(results)
+}
+
+fn read_pointer(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+    let text = reader.text(node, "a JSON pointer, as /state")?;
+    if text.is_empty() || text.starts_with('/') {
+        return Some(text.to_owned());
+    }
+    let message = format!("expected a JSON pointer, as /state, found `{text}`");
+    reader.refuse(node, Code::WrongValue, message)
+}
+
+/// Default time limit of a response.
+const WITHIN: Duration = Duration::from_secs(2);
+/// Default time from Halt until the outcome is unknown.
+const HALT: Duration = Duration::from_secs(5);
+/// Default period of polling.
+const POLL: Duration = Duration::from_millis(100);
+/// The longest time without a response to polling.
+const LONGEST_SILENCE: Duration = Duration::from_secs(3);
+const LONGEST_REASON: usize = 200;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,286 @@
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+use skills::{Component, DriverSetup, Outcome, conformance};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpListener;
+use tokio::task::JoinSet;
+
+use super::*;
+use crate::Kinds;
+
+/// A device that answers requests as its fields say, and records them.
+#[derive(Debug, Default)]
+struct Press {
+    seen: Vec<String>,
+    /// The status of the response to a start; 0 for no response.
+    start: u16,
+    /// The states that polling returns in turn; the last is repeated. An empty state is no
+    /// response.
+    states: Vec<&'static str>,
+    stopped: bool,
+}
+
+impl Press {
+    /// Returns the status and the body of a response; `None` for no response.
+    fn answer(&mut self, request: &str, body: &str) -> Option<(u16, String)> {
+        self.seen
+            .push(format!("{request} {body}").trim().to_owned());
+        if request.starts_with("POST /start") {
+            let body = r#"{"message": "busy", "gripped": true}"#.to_owned();
+            return (self.start > 0).then_some((self.start, body));
+        }
+        if request.starts_with("POST /stop") {
+            self.stopped = true;
+            return Some((200, String::new()));
+        }
+        let state = match self.states.len() {
+            0 | 1 => self.states.first().copied().unwrap_or("running"),
+            _ => self.states.remove(0),
+        };
+        let state = if self.stopped { "aborted" } else { state };
+        let body = format!(
+            r#"{{"job": {{"state": "{state}", "share": 0.5, "why": "no part", "gripped": true}}}}"#
+        );
+        (!state.is_empty()).then_some((200, body))
+    }
+}
+
+struct Bench {
+    press: Arc<Mutex<Press>>,
+    address: String,
+    _task: JoinSet<()>,
+}
+
+impl Bench {
+    async fn new(start: u16, states: &[&'static str]) -> Self {
+        let press = Arc::new(Mutex::new(Press {
+            start,
+            states: states.to_vec(),
+            ..Press::default()
+        }));
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        let mut task = JoinSet::new();
+        let served = Arc::clone(&press);
+        task.spawn(async move {
+            let mut clients = JoinSet::new();
+            while let Ok((mut stream, _)) = listener.accept().await {
+                let press = Arc::clone(&served);
+                clients.spawn(async move {
+                    let mut bytes = Vec::new();
+                    let mut chunk = [0; 1024];
+                    loop {
+                        let Ok(count @ 1..) = stream.read(&mut chunk).await else {
+                            return;
+                        };
+                        bytes.extend_from_slice(&chunk[..count]);
+                        let text = String::from_utf8_lossy(&bytes).into_owned();
+                        let Some((head, body)) = text.split_once("\r\n\r\n") else {
+                            continue;
+                        };
+                        let length = head.lines().find_map(|line| {
+                            let (name, value) = line.split_once(": ")?;
+                            name.eq_ignore_ascii_case("content-length")
+                                .then_some(value)?
+                                .parse()
+                                .ok()
+                        });
+                        if body.len() < length.unwrap_or(0) {
+                            continue;
+                        }
+                        let line = head.lines().next().unwrap_or_default();
+                        let line = line.trim_end_matches(" HTTP/1.1");
+                        let answer = press.lock().unwrap().answer(line, body);
+                        let Some((status, body)) = answer else {
+                            std::future::pending::<()>().await;
+                            return;
+                        };
+                        let length = body.len();
+                        let answer = format!(
+                            "HTTP/1.1 {status} X\r\ncontent-length: {length}\r\n\r\n{body}"
+                        );
+                        // The client may be gone.
+                        let _written = stream.write_all(answer.as_bytes()).await;
+                        return;
+                    }
+                });
+            }
+        });
+        Self {
+            press,
+            address,
+            _task: task,
+        }
+    }
+
+    fn driver(&self, http: &str) -> Arc<dyn Driver> {
+        let http = http.replace("PRESS", &format!("http://{}", self.address));
+        driver(&http).unwrap()
+    }
+
+    async fn run(&self, http: &str) -> Outcome {
+        let force = vec![("Force".to_owned(), Value::from(12.5))];
+        conformance::run_once("GraspSkillType", self.driver(http), force)
+            .await
+            .unwrap()
+    }
+
+    fn seen(&self) -> Vec<String> {
+        self.press.lock().unwrap().seen.clone()
+    }
+}
+
+fn driver(http: &str) -> Result<Arc<dyn Driver>, String> {
+    let text = format!(
+        "component: x\napplication_uri: urn:x\nnamespace: 1\nskills:\n  - {{name: Grasp, type: GraspSkillType, driver: {{http: {http}}}}}\n"
+    );
+    let component = Component::from_yaml_with(&text, Path::new(""), &Kinds)
+        .map_err(|findings| findings.render("x.yaml", &text))?;
+    match &component.skills[0].driver {
+        DriverSetup::Given(driver) => Ok(Arc::clone(driver)),
+        other => Err(format!("{other:?}")),
+    }
+}
+
+const POLLED: &str = "{start: {url: \"PRESS/start/{Force}\", body: {force: \"{Force}\", text: \"{Force} N\", mode: 2}}, \
+    poll: {url: PRESS/state, every: 20 ms, done: {/job/state: done}, failed: {/job/state: [error, aborted]}, \
+    progress: /job/share, step: /job/state, reason: /job/why}, results: {Gripped: /job/gripped}, stop: PRESS/stop, \
+    within: 1 s, halt_timeout: 2 s}";
+
+#[tokio::test]
+async fn a_run_is_started_with_its_parameters_and_polled_to_its_results() {
+    let bench = Bench::new(202, &["running", "closing", "done"]).await;
+    let outcome = bench.run(POLLED).await;
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(outcome.results, [("Gripped".to_owned(), true.into())]);
+    assert!(
+        outcome.trace.iter().any(|line| line.ends_with(" closing")),
+        "{:?}",
+        outcome.trace
+    );
+    let start = "POST /start/12.5 {\"force\":12.5,\"mode\":2,\"text\":\"12.5 N\"}";
+    assert_eq!(bench.seen()[0], start);
+    assert!(!bench.press.lock().unwrap().stopped);
+}
+
+#[tokio::test]
+async fn it_is_as_a_driver_should_be_and_halt_stops_the_device() {
+    let bench = Bench::new(200, &[]).await;
+    let press = Arc::clone(&bench.press);
+    let again = move || {
+        let mut press = press.lock().unwrap();
+        press.stopped = false;
+        press.states = vec!["running", "running", "running", "done"];
+        Vec::new()
+    };
+    conformance::check("GraspSkillType", bench.driver(POLLED), again)
+        .await
+        .unwrap();
+    let seen = bench.seen();
+    assert!(seen.iter().any(|line| line == "POST /stop"), "{seen:?}");
+}
+
+#[tokio::test]
+async fn a_failure_has_its_reason_and_a_refused_start_moves_nothing() {
+    let failed = Bench::new(200, &["running", "error"]).await;
+    let outcome = failed.run(POLLED).await;
+    assert_eq!(
+        (outcome.succeeded, outcome.message.as_str()),
+        (false, "no part")
+    );
+    let refused = Bench::new(409, &[]).await;
+    let outcome = refused.run(POLLED).await;
+    assert!(outcome.message.contains("refuses with 409") && outcome.message.contains("busy"));
+    assert!(!refused.press.lock().unwrap().stopped);
+    let nobody = driver("{start: \"http://127.0.0.1:1/start\"}").unwrap();
+    let outcome = conformance::run_once("GraspSkillType", nobody, Vec::new())
+        .await
+        .unwrap();
+    assert!(
+        outcome.message.contains("cannot be reached"),
+        "{}",
+        outcome.message
+    );
+}
+
+#[tokio::test]
+async fn a_start_without_an_answer_is_unknown_and_the_device_is_stopped() {
+    for status in [0, 500] {
+        let bench = Bench::new(status, &[]).await;
+        let outcome = bench.run(POLLED).await;
+        assert!(!outcome.succeeded);
+        let why = &outcome.message;
+        assert!(why.contains("the `stop` request is done"), "{why}");
+        assert!(bench.press.lock().unwrap().stopped);
+    }
+}
+
+#[tokio::test]
+async fn a_response_can_be_the_end_of_the_run() {
+    let bench = Bench::new(200, &[]).await;
+    let outcome = bench
+        .run("{start: PRESS/start, results: {Gripped: /gripped}}")
+        .await;
+    assert!(outcome.succeeded, "{}", outcome.message);
+    assert_eq!(outcome.results, [("Gripped".to_owned(), true.into())]);
+    let outcome = bench
+        .run("{start: PRESS/start, results: {Gripped: /held}}")
+        .await;
+    assert!(
+        outcome.message.contains("the response has no /held"),
+        "{}",
+        outcome.message
+    );
+}
+
+#[test]
+fn parameters_fill_templates_as_values_as_text_and_escaped_in_a_path() {
+    let value = |name: &str| match name {
+        "Name" => Ok(Json::from("a b/c")),
+        "Force" => Ok(Json::from(2.5)),
+        other => Err(format!("{other} is not a parameter of the skill")),
+    };
+    let body = serde_json::json!({"n": "{Name}", "f": ["{Force}", "{Force} N", "{ x }", 1]});
+    let expected = serde_json::json!({"n": "a b/c", "f": [2.5, "2.5 N", "{ x }", 1]});
+    assert_eq!(filled(&body, &value), Ok(expected));
+    let path = fill("/{Name}?f={Force}", &|name| {
+        Ok(escaped(&plain(&value(name)?)))
+    });
+    assert_eq!(path.unwrap(), "/a%20b%2Fc?f=2.5");
+    assert!(filled(&"{Speed}".into(), &value).is_err());
+}
+
+#[test]
+fn wrong_requests_are_findings() {
+    for (http, expected) in [
+        ("{}", "`start` is missing"),
+        ("{start: \"https://h/x\"}", "expected http://host"),
+        ("{start: \"http://h:0/x\"}", "expected http://host"),
+        ("{start: \"http://a@h/x\"}", "expected http://host"),
+        (
+            "{start: {url: \"http://h/x\", method: BREW}}",
+            "found `BREW`",
+        ),
+        (
+            "{start: \"http://h/x\", poll: {url: \"http://h/y\"}}",
+            "`done` is missing",
+        ),
+        (
+            "{start: \"http://h/x\", poll: {url: \"http://h/y\", done: {state: done}}}",
+            "a JSON pointer",
+        ),
+        (
+            "{start: \"http://h/x\", results: [a]}",
+            "a map from results",
+        ),
+    ] {
+        let Err(told) = driver(http) else {
+            panic!("{http} has no finding")
+        };
+        assert!(
+            told.contains(expected) && told.contains("x.yaml:5:"),
+            "{http}: {told}"
+        );
+    }
+}

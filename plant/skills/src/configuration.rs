@@ -1,0 +1,559 @@
+//! The configuration of a component: limits, defaults, periods and product data that an admitted
+//! client sets while the component runs.
+//!
+//! A configuration is checked as a whole, stored, and then applied as a whole. It acts on the next
+//! run of each skill; a run in progress keeps its parameters.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use serde_json::Value as Json;
+use tokio::sync::watch;
+
+use crate::driver::{Driver, Results, Work};
+use crate::parameters::{Parameter, Parameters, shortened};
+use crate::value::Value;
+use crate::values::ValueFacts;
+use crate::yaml::{Code, Finding, Place, nearest};
+
+/// A field of the configuration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Configurable {
+    /// The description.
+    pub facts: Arc<ValueFacts>,
+    /// The value without a configuration.
+    pub default: Option<Value>,
+    /// The effect.
+    pub effect: Effect,
+    /// The skills on which it acts; empty for all skills.
+    pub skills: Vec<String>,
+    /// The location in the document.
+    pub place: Place,
+}
+
+/// The effect of a field.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Effect {
+    /// The highest value of a parameter: higher values are lowered.
+    Limits(String),
+    /// The value of a parameter that is not given.
+    Sets(String),
+    /// The period of measurements in ms, of the named value or of all values.
+    Period(Option<String>),
+    /// Data for programs of the user.
+    Data,
+}
+
+/// A configuration that is not accepted.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{field}: {reason}")]
+pub struct NotConfigured {
+    /// The first wrong field; empty if the fault is not that of a field.
+    pub field: String,
+    /// The reason, as text for people.
+    pub reason: String,
+}
+
+/// The values of the fields.
+type Values = BTreeMap<String, Value>;
+
+/// The configuration of a component. Clones share it.
+#[derive(Debug, Clone)]
+pub struct Configuration {
+    fields: Arc<Vec<Configurable>>,
+    values: watch::Sender<Arc<Values>>,
+    store: Option<Arc<PathBuf>>,
+}
+
+impl Default for Configuration {
+    fn default() -> Self {
+        Self::new(Vec::new(), None)
+    }
+}
+
+impl Configuration {
+    /// Creates the configuration with the values in `store`, a file that is written at each change.
+    /// Stored values that do not fit any more are ignored, with a warning.
+    #[must_use]
+    pub fn new(fields: Vec<Configurable>, store: Option<&Path>) -> Self {
+        let configuration = Self {
+            fields: Arc::new(fields),
+            values: watch::Sender::new(Arc::default()),
+            store: store.map(|path| Arc::new(path.to_owned())),
+        };
+        let stored = store.filter(|_| !configuration.fields.is_empty());
+        match stored.map(read) {
+            None | Some(Ok(None)) => {}
+            Some(Ok(Some(stored))) => configuration.restore(&stored),
+            Some(Err(why)) => tracing::warn!("the stored configuration is not used: {why}"),
+        }
+        configuration
+    }
+
+    /// Returns the fields.
+    #[must_use]
+    pub fn fields(&self) -> &[Configurable] {
+        &self.fields
+    }
+
+    /// Returns the values of the configured fields, and their changes.
+    #[must_use]
+    pub fn watch(&self) -> watch::Receiver<Arc<Values>> {
+        self.values.subscribe()
+    }
+
+    /// Returns the value of a field: as configured, or its default.
+    #[must_use]
+    pub fn value(&self, field: &Configurable) -> Option<Value> {
+        let configured = self.values.borrow().get(&field.facts.name).cloned();
+        configured.or_else(|| field.default.clone())
+    }
+
+    /// Sets some fields; other fields keep their values. Nothing is set if one of them is wrong or
+    /// if the configuration cannot be stored.
+    ///
+    /// # Errors
+    /// The first wrong field, with the reason.
+    pub fn set(&self, given: Vec<(String, Value)>) -> Result<(), NotConfigured> {
+        let mut values = Values::clone(&self.values.borrow());
+        let mut seen: Vec<String> = Vec::new();
+        for (name, value) in given {
+            let wrong = |reason: String| NotConfigured {
+                field: name.clone(),
+                reason,
+            };
+            let field = self.fields.iter().find(|field| field.facts.name == name);
+            let Some(field) = field else {
+                let names: Vec<&str> = self.fields.iter().map(|of| &*of.facts.name).collect();
+                let names = names.join(", ");
+                let name = shortened(&name);
+                return Err(wrong(format!(
+                    "there is no field {name}; the fields are {names}"
+                )));
+            };
+            if seen.contains(&name) {
+                return Err(wrong("the field is given twice".to_owned()));
+            }
+            let value = field.take(value).map_err(wrong)?;
+            seen.push(name.clone());
+            values.insert(name, value);
+        }
+        if let Some(store) = &self.store {
+            write(store, &values).map_err(|reason| NotConfigured {
+                field: String::new(),
+                reason,
+            })?;
+        }
+        self.values.send_replace(Arc::new(values));
+        Ok(())
+    }
+
+    fn restore(&self, stored: &serde_json::Map<String, Json>) {
+        let mut values = Values::new();
+        for (name, json) in stored {
+            let field = self.fields.iter().find(|field| field.facts.name == *name);
+            let value = match field {
+                None => Err("there is no such field".to_owned()),
+                Some(field) => field
+                    .facts
+                    .shape
+                    .read_json(json)
+                    .and_then(|value| field.take(value)),
+            };
+            match value {
+                Ok(value) => drop(values.insert(name.clone(), value)),
+                Err(why) => tracing::warn!(field = name, "the stored value is not used: {why}"),
+            }
+        }
+        self.values.send_replace(Arc::new(values));
+    }
+
+    /// Returns the fields that act on a skill, with their values.
+    fn of_skill<'c>(
+        &'c self,
+        skill: &'c str,
+    ) -> impl Iterator<Item = (&'c Configurable, Value)> + 'c {
+        let acting = self.fields.iter().filter(move |field| field.acts_on(skill));
+        acting.filter_map(|field| Some((field, self.value(field)?)))
+    }
+
+    /// Returns the configured period of the measurements of values with these names.
+    pub(crate) fn period(&self, names: &[String]) -> Option<Duration> {
+        let periods = self.fields.iter().filter_map(|field| {
+            let Effect::Period(of) = &field.effect else {
+                return None;
+            };
+            let is_meant = of.as_ref().is_none_or(|name| names.contains(name));
+            let ms = self.value(field).filter(|_| is_meant)?.as_f64()?;
+            Duration::try_from_secs_f64(ms / 1000.0).ok()
+        });
+        periods.min()
+    }
+
+    /// Returns the driver with the effects of the configuration on a skill.
+    #[must_use]
+    pub fn applied(&self, skill: &str, driver: Arc<dyn Driver>) -> Arc<dyn Driver> {
+        if !self.fields.iter().any(|field| field.acts_on(skill)) {
+            return driver;
+        }
+        Arc::new(Configured {
+            skill: skill.to_owned(),
+            configuration: self.clone(),
+            driver,
+        })
+    }
+}
+
+impl Configurable {
+    /// Returns a finding if no skill has the parameter of the field. Each skill has its name and
+    /// its parameters.
+    pub(crate) fn lacks_parameter(&self, skills: &[(&str, &[Parameter])]) -> Option<Finding> {
+        let (Effect::Limits(wanted) | Effect::Sets(wanted)) = &self.effect else {
+            return None;
+        };
+        let acting = skills.iter().filter(|(skill, _)| self.acts_on(skill));
+        let parameters: Vec<&Parameter> = acting.flat_map(|(_, of)| of.iter()).collect();
+        if parameters.iter().any(|parameter| parameter.name == *wanted) {
+            return None;
+        }
+        let names: Vec<&str> = parameters.iter().map(|of| of.name.as_str()).collect();
+        let message = format!("no skill has a parameter `{}`", shortened(wanted));
+        let finding = Finding::error(Code::WrongValue, self.place, message);
+        Some(match nearest(wanted, &names) {
+            Some(near) => finding.with_help(format!("did you mean `{near}`?")),
+            None => finding,
+        })
+    }
+
+    fn acts_on(&self, skill: &str) -> bool {
+        let acts = !matches!(self.effect, Effect::Period(_));
+        acts && (self.skills.is_empty() || self.skills.iter().any(|name| name == skill))
+    }
+
+    /// Converts a value to the type of the field and checks it.
+    ///
+    /// # Errors
+    /// The reason why it does not fit.
+    pub fn take(&self, value: Value) -> Result<Value, String> {
+        let ValueFacts {
+            shape, range, unit, ..
+        } = &*self.facts;
+        let given = value.shape();
+        let Some(value) = shape.take(value) else {
+            return Err(format!("expected {shape}, found {given}"));
+        };
+        if value.is_unreal() {
+            return Err(format!("{value} is not a number"));
+        }
+        if let Value::String(text) = &value
+            && (text.len() > LONGEST_TEXT || text.contains(char::is_control))
+        {
+            return Err(format!("expected a line of at most {LONGEST_TEXT} bytes"));
+        }
+        let elements = if let Value::Array(_, elements) = &value {
+            elements.as_slice()
+        } else {
+            std::slice::from_ref(&value)
+        };
+        if elements.len() > MOST_ELEMENTS {
+            return Err(format!("expected at most {MOST_ELEMENTS} elements"));
+        }
+        if let Some((low, high)) = range
+            && let Some(outside) = elements
+                .iter()
+                .filter_map(Value::as_f64)
+                .find(|number| !(*low..=*high).contains(number))
+        {
+            let unit = unit.as_ref().map(|unit| format!(" {unit}"));
+            let unit = unit.unwrap_or_default();
+            return Err(format!("expected {low} to {high}{unit}, found {outside}"));
+        }
+        Ok(value)
+    }
+}
+
+/// A driver with the effects of the configuration.
+struct Configured {
+    skill: String,
+    configuration: Configuration,
+    driver: Arc<dyn Driver>,
+}
+
+#[async_trait]
+impl Driver for Configured {
+    fn can_suspend(&self) -> bool {
+        self.driver.can_suspend()
+    }
+
+    fn halt_timeout(&self) -> Option<Duration> {
+        self.driver.halt_timeout()
+    }
+
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        self.driver.check(parameters)
+    }
+
+    fn uses(&self) -> Vec<String> {
+        self.driver.uses()
+    }
+
+    /// Adds the configured parameters, and lowers those above their limits.
+    fn prepared(
+        &self,
+        declared: &[Parameter],
+        mut given: Vec<(String, Value)>,
+    ) -> Vec<(String, Value)> {
+        for (field, value) in self.configuration.of_skill(&self.skill) {
+            if let Effect::Sets(parameter) = &field.effect
+                && declared.iter().any(|known| known.name == *parameter)
+                && !given.iter().any(|(name, _)| name == parameter)
+            {
+                given.push((parameter.clone(), value));
+            }
+        }
+        for (field, limit) in self.configuration.of_skill(&self.skill) {
+            let Effect::Limits(parameter) = &field.effect else {
+                continue;
+            };
+            let Some(known) = declared.iter().find(|known| known.name == *parameter) else {
+                continue;
+            };
+            match given.iter_mut().find(|(name, _)| name == parameter) {
+                Some((_, value)) => *value = lowered(value.clone(), &limit),
+                None => {
+                    let default = known.default.clone();
+                    given.extend(default.map(|value| (parameter.clone(), lowered(value, &limit))));
+                }
+            }
+        }
+        given
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let configured: Vec<(String, Value)> = self
+            .configuration
+            .of_skill(&self.skill)
+            .map(|(field, value)| (field.facts.name.clone(), value))
+            .collect();
+        for (name, value) in &configured {
+            work.note(format!("configured: {name} is {value}")).await;
+        }
+        self.driver.run(work.with_configuration(configured)).await
+    }
+}
+
+/// Lowers a number, and each number of an array, to a limit.
+fn lowered(value: Value, limit: &Value) -> Value {
+    let Some(highest) = limit.as_f64() else {
+        return value;
+    };
+    if let Value::Array(builtin, elements) = value {
+        let elements = elements.into_iter().map(|element| lowered(element, limit));
+        return Value::Array(builtin, elements.collect());
+    }
+    match value.as_f64() {
+        Some(number) if number > highest => {
+            let shape = value.shape();
+            // A limit that is not a whole number is rounded down for a whole parameter.
+            let whole = shape.read_json(&Json::from(highest));
+            let floor = || {
+                let json: Json = serde_json::from_str(&format!("{:.0}", highest.floor())).ok()?;
+                shape.read_json(&json).ok()
+            };
+            whole.ok().or_else(floor).unwrap_or(value)
+        }
+        _ => value,
+    }
+}
+
+fn read(path: &Path) -> Result<Option<serde_json::Map<String, Json>>, String> {
+    let cannot = |why: &dyn std::fmt::Display| format!("cannot read {}: {why}", path.display());
+    let length = match std::fs::metadata(path) {
+        Ok(about) => about.len(),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(cannot(&error)),
+    };
+    if length > LONGEST_FILE {
+        return Err(cannot(&"the file is too long"));
+    }
+    let text = std::fs::read_to_string(path).map_err(|error| cannot(&error))?;
+    match serde_json::from_str(&text) {
+        Ok(Json::Object(values)) => Ok(Some(values)),
+        Ok(_) => Err(cannot(&"it is not a JSON object")),
+        Err(error) => Err(cannot(&error)),
+    }
+}
+
+fn write(path: &Path, values: &Values) -> Result<(), String> {
+    let cannot = |why: &dyn std::fmt::Display| format!("cannot write {}: {why}", path.display());
+    let json: serde_json::Map<String, Json> = values
+        .iter()
+        .map(|(name, value)| (name.clone(), value.to_json()))
+        .collect();
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder).map_err(|error| cannot(&error))?;
+    }
+    let text = format!("{}\n", Json::Object(json));
+    plant_opcua::synced::replace(path, text.as_bytes()).map_err(|error| cannot(&error))
+}
+
+const LONGEST_TEXT: usize = 4096;
+const MOST_ELEMENTS: usize = 1024;
+const LONGEST_FILE: u64 = 1 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::conformance;
+    use crate::value::{Builtin, Shape};
+
+    fn field(name: &str, effect: Effect, range: Option<(f64, f64)>) -> Configurable {
+        let builtin = match effect {
+            Effect::Data => Builtin::String,
+            Effect::Limits(_) | Effect::Sets(_) | Effect::Period(_) => Builtin::Double,
+        };
+        Configurable {
+            facts: Arc::new(ValueFacts {
+                name: name.to_owned(),
+                shape: Shape::scalar(builtin),
+                unit: None,
+                range,
+                about: String::new(),
+            }),
+            default: None,
+            effect,
+            skills: Vec::new(),
+            place: Place::START,
+        }
+    }
+
+    fn fields() -> Vec<Configurable> {
+        vec![
+            field(
+                "ForceLimit",
+                Effect::Limits("Force".to_owned()),
+                Some((5.0, 50.0)),
+            ),
+            field("UsualForce", Effect::Sets("Force".to_owned()), None),
+            field("Product", Effect::Data, None),
+        ]
+    }
+
+    fn given(name: &str, value: impl Into<Value>) -> Vec<(String, Value)> {
+        vec![(name.to_owned(), value.into())]
+    }
+
+    /// Succeeds, and records the force and the configuration of each run.
+    #[derive(Default)]
+    struct Recorder(std::sync::Mutex<Vec<(f64, usize)>>);
+
+    #[async_trait]
+    impl Driver for Recorder {
+        async fn run(&self, work: Work) -> Result<Results, String> {
+            let force = work.parameters().number("Force").unwrap();
+            let configured = work.configuration().len();
+            self.0.lock().unwrap().push((force, configured));
+            Ok(given("Gripped", true))
+        }
+    }
+
+    #[tokio::test]
+    async fn a_configuration_acts_on_the_next_run() {
+        let configuration = Configuration::new(fields(), None);
+        let recorder = Arc::new(Recorder::default());
+        let driver = configuration.applied("GraspSkillType", recorder.clone());
+        let run = async |force: Vec<(String, Value)>| {
+            let run = conformance::run_once("GraspSkillType", driver.clone(), force);
+            let outcome = run.await.unwrap();
+            assert!(outcome.succeeded, "{}", outcome.message);
+            outcome.trace
+        };
+        run(given("Force", 80.0)).await;
+        configuration.set(given("ForceLimit", 30.0)).unwrap();
+        let trace = run(given("Force", 80.0)).await;
+        let noted = |line: &String| line.ends_with("configured: ForceLimit is 30.0");
+        assert!(trace.iter().any(noted), "{trace:?}");
+        run(given("Force", 12.0)).await;
+        configuration.set(given("UsualForce", 25.0)).unwrap();
+        run(Vec::new()).await;
+        configuration.set(given("UsualForce", 40.0)).unwrap();
+        run(Vec::new()).await;
+        let seen = recorder.0.lock().unwrap().clone();
+        assert_eq!(
+            seen,
+            [(80.0, 0), (30.0, 1), (12.0, 1), (25.0, 2), (30.0, 2)]
+        );
+    }
+
+    #[test]
+    fn a_wrong_field_is_refused_with_its_reason_and_nothing_is_set() {
+        let configuration = Configuration::new(fields(), None);
+        let refused = |values: Vec<(String, Value)>| {
+            let refused = configuration.set(values).unwrap_err();
+            (refused.field, refused.reason)
+        };
+        let both = [given("Product", "A"), given("ForceLimit", 60.0)].concat();
+        let reason = "expected 5 to 50, found 60".to_owned();
+        assert_eq!(refused(both), ("ForceLimit".to_owned(), reason));
+        assert!(configuration.watch().borrow().is_empty());
+        assert!(
+            refused(given("Speed", 1.0))
+                .1
+                .contains("ForceLimit, UsualForce, Product")
+        );
+        assert!(
+            refused(given("Product", 1.0))
+                .1
+                .contains("expected String, found Double")
+        );
+        assert!(
+            refused(given("ForceLimit", f64::NAN))
+                .1
+                .contains("is not a number")
+        );
+        assert!(refused(given("Product", "a\nb")).1.contains("a line"));
+        let twice = [given("Product", "A"), given("Product", "B")].concat();
+        assert!(refused(twice).1.contains("twice"));
+    }
+
+    #[test]
+    fn a_configuration_is_there_again_after_a_restart_and_unfit_values_are_left_out() {
+        let folder = std::env::temp_dir().join(format!("configuration-{}", std::process::id()));
+        let path = folder.join("configuration.json");
+        let configuration = Configuration::new(fields(), Some(&path));
+        let both = [given("Product", "A"), given("ForceLimit", 20.0)].concat();
+        configuration.set(both).unwrap();
+        let again = Configuration::new(fields(), Some(&path));
+        assert_eq!(*again.watch().borrow(), *configuration.watch().borrow());
+        let mut narrower = fields();
+        narrower.truncate(1);
+        narrower[0] = field(
+            "ForceLimit",
+            Effect::Limits("Force".to_owned()),
+            Some((0.0, 10.0)),
+        );
+        let narrow = Configuration::new(narrower, Some(&path));
+        assert!(narrow.watch().borrow().is_empty());
+        std::fs::write(&path, "[").unwrap();
+        assert!(
+            Configuration::new(fields(), Some(&path))
+                .watch()
+                .borrow()
+                .is_empty()
+        );
+        std::fs::remove_file(&path).unwrap();
+        std::fs::create_dir(&path).unwrap();
+        let refused = configuration.set(given("Product", "B")).unwrap_err();
+        assert!(refused.reason.contains("cannot write"), "{refused}");
+        let product = configuration.watch().borrow().get("Product").cloned();
+        assert_eq!(
+            product,
+            Some("A".into()),
+            "what cannot be stored is not applied"
+        );
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+}

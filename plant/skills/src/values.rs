@@ -1,0 +1,411 @@
+//! Values of a component: variables that a sensor measures or that are computed from the runs of
+//! its skills.
+//!
+//! A [`Sensor`] measures until an error occurs; [`watch`] restarts it with growing pauses. The
+//! newest [`Reading`] of each value is kept: a number with the time of the measurement, or the
+//! reason why it is unknown.
+
+mod statistics;
+
+use std::fmt::Debug;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use async_trait::async_trait;
+use serde_json::Value as Json;
+use tokio::sync::watch;
+use tokio::time::{Instant, sleep};
+
+pub use self::statistics::{Measure, Statistics, Tally};
+use crate::value::{Shape, Value};
+
+/// The constant description of a value.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ValueFacts {
+    /// The name of the value in its component.
+    pub name: String,
+    /// Type and rank.
+    pub shape: Shape,
+    /// The symbol of the unit, as `mbar`.
+    pub unit: Option<String>,
+    /// The lowest and the highest expected value of a number.
+    pub range: Option<(f64, f64)>,
+    /// Description for people.
+    pub about: String,
+}
+
+/// A value that a device measures.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DeviceValue {
+    /// The name.
+    pub name: &'static str,
+    /// Type and rank.
+    pub shape: Shape,
+    /// The symbol of the unit.
+    pub unit: Option<&'static str>,
+    /// The lowest and the highest value.
+    pub range: Option<(f64, f64)>,
+    /// Description for people.
+    pub about: &'static str,
+}
+
+/// A source of values outside of the component.
+#[async_trait]
+pub trait Sensor: Debug + Send + Sync + 'static {
+    /// Measures until an error occurs, about once in `period`. Each measurement is passed to `out`.
+    /// Returns the reason why there are no further measurements, as text for people.
+    async fn measure(&self, period: Duration, out: &Measured) -> String;
+
+    /// Returns the address of the source, for display.
+    fn source(&self) -> String;
+
+    /// Returns the time after which a sensor without a measurement is restarted.
+    fn within(&self, period: Duration) -> Duration {
+        (period * MISSED_PERIODS).max(SHORTEST_WITHIN)
+    }
+}
+
+/// The newest state of a value.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Reading {
+    /// The value, or the reason why it is unknown.
+    pub value: Result<Value, String>,
+    /// Time of the measurement, or of the loss.
+    pub at: SystemTime,
+}
+
+/// A value with its newest reading. Clones share the reading.
+#[derive(Debug, Clone)]
+pub struct LiveValue {
+    facts: Arc<ValueFacts>,
+    reading: watch::Receiver<Reading>,
+}
+
+impl LiveValue {
+    /// Returns the description.
+    #[must_use]
+    pub fn facts(&self) -> &Arc<ValueFacts> {
+        &self.facts
+    }
+
+    /// Returns the newest reading.
+    #[must_use]
+    pub fn reading(&self) -> Reading {
+        self.reading.borrow().clone()
+    }
+
+    /// Returns the readings. Only the newest of rapid changes is delivered.
+    #[must_use]
+    pub fn watch(&self) -> watch::Receiver<Reading> {
+        self.reading.clone()
+    }
+}
+
+/// Receives the measurements of a source.
+#[derive(Debug, Default)]
+pub struct Measured {
+    slots: Vec<Slot>,
+    /// Time of the newest measurement.
+    newest: watch::Sender<Option<Instant>>,
+}
+
+#[derive(Debug)]
+struct Slot {
+    /// The name of the value at its source.
+    key: String,
+    facts: Arc<ValueFacts>,
+    reading: watch::Sender<Reading>,
+}
+
+impl Measured {
+    /// Adds a value, which has the name `key` at the source.
+    pub fn add(&mut self, key: &str, facts: &Arc<ValueFacts>) -> LiveValue {
+        let first = Reading {
+            value: Err(NOT_MEASURED.to_owned()),
+            at: now(),
+        };
+        let (reading, watch) = watch::channel(first);
+        self.slots.push(Slot {
+            key: key.to_owned(),
+            facts: Arc::clone(facts),
+            reading,
+        });
+        LiveValue {
+            facts: Arc::clone(facts),
+            reading: watch,
+        }
+    }
+
+    /// Returns the names at the source of the values that are needed.
+    pub fn keys(&self) -> impl Iterator<Item = &str> {
+        self.slots.iter().map(|slot| slot.key.as_str())
+    }
+
+    /// Returns the names of the values in the component.
+    pub(crate) fn names(&self) -> Vec<String> {
+        self.slots
+            .iter()
+            .map(|slot| slot.facts.name.clone())
+            .collect()
+    }
+
+    /// Takes a measured value, or the reason why it is unknown. Other names are ignored.
+    pub fn put(&self, key: &str, value: Result<Value, String>) {
+        self.touch();
+        for slot in self.slots.iter().filter(|slot| slot.key == key) {
+            slot.put(value.clone());
+        }
+    }
+
+    /// Takes a measured value as JSON; `null` if it is unknown. Other names are ignored.
+    pub fn put_json(&self, key: &str, json: &Json) {
+        self.touch();
+        for slot in self.slots.iter().filter(|slot| slot.key == key) {
+            slot.put_json(json);
+        }
+    }
+
+    /// Takes the value of a source with a single value as JSON.
+    pub fn put_single_json(&self, json: &Json) {
+        self.touch();
+        self.slots.iter().for_each(|slot| slot.put_json(json));
+    }
+
+    /// Takes the reason why all values are unknown.
+    pub fn put_fault(&self, why: &str) {
+        self.touch();
+        self.lose(why);
+    }
+
+    /// Takes the value of a source with a single value.
+    pub fn put_single(&self, value: Result<Value, String>) {
+        self.touch();
+        for slot in &self.slots {
+            slot.put(value.clone());
+        }
+    }
+
+    /// Notes that the source answers, although no value has changed.
+    pub fn touch(&self) {
+        self.newest.send_replace(Some(Instant::now()));
+    }
+
+    /// Marks all values as unknown.
+    fn lose(&self, why: &str) {
+        for slot in &self.slots {
+            slot.put(Err(why.to_owned()));
+        }
+    }
+
+    /// Returns when the source has measured nothing for `within`.
+    async fn overdue(&self, began: Instant, within: Duration) {
+        loop {
+            let newest = *self.newest.borrow();
+            let until = newest.unwrap_or(began).max(began) + within;
+            if until <= Instant::now() {
+                return;
+            }
+            tokio::time::sleep_until(until).await;
+        }
+    }
+}
+
+impl Slot {
+    fn put_json(&self, json: &Json) {
+        self.put(match json.is_null() {
+            true => Err("the source does not know the value".to_owned()),
+            false => self.facts.shape.read_json(json),
+        });
+    }
+
+    fn put(&self, value: Result<Value, String>) {
+        let shape = self.facts.shape;
+        let value = value.and_then(|value| {
+            let found = value.shape();
+            let taken = shape.take(value);
+            taken.ok_or_else(|| format!("the source gives {found}, and the value is {shape}"))
+        });
+        self.reading.send_if_modified(|reading| {
+            // A lost value keeps the time of its loss.
+            let is_new = reading.value != value || value.is_ok();
+            if is_new {
+                *reading = Reading { value, at: now() };
+            }
+            is_new
+        });
+    }
+}
+
+/// Measures as long as the future is polled. A sensor that fails is started again after a pause,
+/// which grows while it fails. A changed period starts it again at once.
+pub(crate) async fn watch(
+    sensor: Arc<dyn Sensor>,
+    mut periods: watch::Receiver<Duration>,
+    out: Measured,
+) {
+    let mut pause = SHORTEST_PAUSE;
+    let mut logged: Option<String> = None;
+    let mut is_fixed = false;
+    loop {
+        let began = Instant::now();
+        let period = *periods.borrow_and_update();
+        let within = sensor.within(period);
+        let why = tokio::select! {
+            // The values stay known while the sensor starts with its new period.
+            changed = periods.changed(), if !is_fixed => {
+                is_fixed = changed.is_err();
+                continue;
+            }
+            why = sensor.measure(period, &out) => why,
+            () = out.overdue(began, within) => {
+                format!("{} has measured nothing for {within:?}", sensor.source())
+            }
+        };
+        let has_measured = out.newest.borrow().is_some_and(|newest| newest > began);
+        out.lose(&why);
+        if has_measured {
+            pause = SHORTEST_PAUSE;
+        }
+        if has_measured || logged.as_ref() != Some(&why) {
+            tracing::warn!(source = sensor.source(), "values are lost: {why}");
+            logged = Some(why);
+        }
+        sleep(pause).await;
+        pause = (pause * 2).min(LONGEST_PAUSE);
+    }
+}
+
+#[expect(
+    clippy::disallowed_methods,
+    reason = "clients compare the time of a measurement with their clocks"
+)]
+fn now() -> SystemTime {
+    SystemTime::now()
+}
+
+/// The reason before the first measurement.
+pub(crate) const NOT_MEASURED: &str = "not measured yet";
+/// Default period of measurements.
+pub(crate) const PERIOD: Duration = Duration::from_millis(200);
+/// Number of periods without a measurement after which a sensor is restarted.
+const MISSED_PERIODS: u32 = 10;
+const SHORTEST_WITHIN: Duration = Duration::from_secs(3);
+const SHORTEST_PAUSE: Duration = Duration::from_millis(250);
+const LONGEST_PAUSE: Duration = Duration::from_secs(4);
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    use super::*;
+    use crate::value::Builtin;
+
+    fn facts(name: &str, builtin: Builtin) -> Arc<ValueFacts> {
+        Arc::new(ValueFacts {
+            name: name.to_owned(),
+            shape: Shape::scalar(builtin),
+            unit: None,
+            range: None,
+            about: String::new(),
+        })
+    }
+
+    /// Measures once in each period. Every third measurement fails.
+    #[derive(Debug, Default)]
+    struct Counter(AtomicU32);
+
+    #[async_trait]
+    impl Sensor for Counter {
+        async fn measure(&self, period: Duration, out: &Measured) -> String {
+            loop {
+                let count = self.0.fetch_add(1, Ordering::Relaxed) + 1;
+                if count.is_multiple_of(3) {
+                    return "unplugged".to_owned();
+                }
+                out.put("Count", Ok(count.into()));
+                sleep(period).await;
+            }
+        }
+
+        fn source(&self) -> String {
+            "a counter".to_owned()
+        }
+    }
+
+    const WITHIN: Duration = Duration::from_millis(100);
+
+    #[derive(Debug)]
+    struct Silent;
+
+    #[async_trait]
+    impl Sensor for Silent {
+        async fn measure(&self, _period: Duration, _out: &Measured) -> String {
+            std::future::pending().await
+        }
+
+        fn source(&self) -> String {
+            "a wire".to_owned()
+        }
+
+        fn within(&self, _period: Duration) -> Duration {
+            WITHIN
+        }
+    }
+
+    #[tokio::test]
+    async fn a_value_is_unknown_with_its_reason_until_the_sensor_measures_again() {
+        let mut out = Measured::default();
+        let value = out.add("Count", &facts("Count", Builtin::UInt32));
+        assert_eq!(value.reading().value, Err(NOT_MEASURED.to_owned()));
+        let mut watch_value = value.watch();
+        let task = tokio::spawn(watch(
+            Arc::new(Counter::default()),
+            watch::Sender::new(Duration::from_millis(50)).subscribe(),
+            out,
+        ));
+        let mut seen = Vec::new();
+        while seen.len() < 4 {
+            watch_value.changed().await.unwrap();
+            seen.push(watch_value.borrow_and_update().value.clone());
+        }
+        let expected = [
+            Ok(Value::UInt32(1)),
+            Ok(Value::UInt32(2)),
+            Err("unplugged".to_owned()),
+            Ok(Value::UInt32(4)),
+        ];
+        assert_eq!(seen, expected);
+        task.abort();
+    }
+
+    #[tokio::test]
+    async fn a_sensor_that_measures_nothing_is_not_waited_for_and_tried_again() {
+        let mut out = Measured::default();
+        let value = out.add("Level", &facts("Level", Builtin::Double));
+        let mut watch_value = value.watch();
+        let began = Instant::now();
+        let task = tokio::spawn(watch(
+            Arc::new(Silent),
+            watch::Sender::new(PERIOD).subscribe(),
+            out,
+        ));
+        watch_value.changed().await.unwrap();
+        let lost = Err("a wire has measured nothing for 100ms".to_owned());
+        assert_eq!(watch_value.borrow_and_update().value, lost);
+        assert!(began.elapsed() >= WITHIN);
+        task.abort();
+    }
+
+    #[test]
+    fn a_value_of_another_type_is_refused_and_a_wider_number_is_taken() {
+        let mut out = Measured::default();
+        let level = out.add("", &facts("Level", Builtin::Double));
+        out.put_single(Ok(Value::Float(0.5)));
+        assert_eq!(level.reading().value, Ok(Value::Double(0.5)));
+        out.put_single(Ok("full".into()));
+        let refused = "the source gives String, and the value is Double".to_owned();
+        assert_eq!(level.reading().value, Err(refused));
+        out.put("Other", Ok(1.0.into()));
+        assert!(level.reading().value.is_err());
+    }
+}
