@@ -215,6 +215,12 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
                 ("parameters", "skill", "urn:example:gripper#i=100"),
                 ("where-is", "name", "Grasp"),
                 ("components", "component", "urn:ua-bridge:mtp:two"),
+                ("components-of", "module", "urn:ua-bridge:mtp:two"),
+                ("services-of", "module", "urn:ua-bridge:mtp:one"),
+                ("skills-for", "capability", GRASP),
+                ("transitions-now", "state", "Idle"),
+                ("access-of", "name", "Grasp"),
+                ("modules-with", "what", "AnaServParam"),
             ]
             .map(|(question, parameter, value)| {
                 (
@@ -266,6 +272,7 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
         "run-steps",
         "run-values",
         "runs",
+        "transitions-now",
     ];
     assert_eq!(empty, expected);
 }

@@ -27,6 +27,7 @@ mod late_subscribers;
 mod loop_silence;
 mod mes;
 mod metadata;
+mod modules;
 mod mqtt;
 mod niryo;
 mod page;

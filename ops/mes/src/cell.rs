@@ -96,6 +96,10 @@ impl Cell {
         }
     }
 
+    pub(crate) fn knowledge(&self) -> &Knowledge {
+        &self.knowledge
+    }
+
     pub(crate) fn client(&self) -> &ClientOptions {
         &self.client
     }

@@ -7,11 +7,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use discovery::{Found, Known, Watcher};
-use skills::{SkillClient, SkillFault};
+use knowledge::{ComponentFacts, NodeName};
+use skills::{FoundSkill, SkillClient, SkillFault};
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::{debug, warn};
 
 use crate::cell::{Cell, Seen, now, since_1970};
+use crate::live;
 
 /// Follows discovery until it ends. With `only_loopback`, servers at other addresses are ignored.
 pub(crate) async fn follow(cell: Arc<Cell>, mut watcher: Watcher, only_loopback: bool) {
@@ -49,7 +51,7 @@ pub(crate) async fn follow(cell: Arc<Cell>, mut watcher: Watcher, only_loopback:
     }
 }
 
-/// Queries the skills of a server until the server responds.
+/// Queries the skills of a server, and publishes their states while it is connected.
 async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
     if only_loopback && !is_loopback(&known.url) {
         warn!(
@@ -66,7 +68,7 @@ async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
     let mut again = AGAIN;
     loop {
         match once(&cell, &seen).await {
-            Ok(()) => return,
+            Ok(()) => again = AGAIN,
             Err(fault) => debug!(url = seen.url, "a server does not tell its skills: {fault}"),
         }
         tokio::time::sleep(again).await;
@@ -79,17 +81,33 @@ async fn once(cell: &Cell, seen: &Seen) -> Result<(), SkillFault> {
     let found = client.skills().await;
     let uri = client.application_uri();
     let listed = now();
-    client.close().await;
-    let found = found?;
-    if found.is_empty() {
-        debug!(url = seen.url, "a server has no skills");
-    } else if uri.is_empty() {
+    let found = match found {
+        Ok(found) if found.is_empty() => {
+            client.close().await;
+            debug!(url = seen.url, "a server has no skills");
+            // Another announcement of the server starts another query.
+            return std::future::pending().await;
+        }
+        Ok(found) => found,
+        Err(fault) => {
+            client.close().await;
+            return Err(fault);
+        }
+    };
+    if uri.is_empty() {
+        client.close().await;
         return Err(SkillFault::Unexpected(
             "it does not say who it is".to_owned(),
         ));
-    } else {
-        cell.came(seen, &uri, found, listed);
     }
+    cell.came(seen, &uri, found.clone(), listed);
+    let facts = ComponentFacts {
+        application_uri: uri.clone(),
+        ..ComponentFacts::default()
+    };
+    let iri = |found: &FoundSkill| Some(facts.skill_iri(&NodeName::parse(&found.node)?));
+    live::skills(cell.knowledge(), &client, (&uri, &found), iri).await;
+    client.close().await;
     Ok(())
 }
 

@@ -17,6 +17,7 @@ mod cell;
 mod execute;
 mod execution_skill;
 mod follow;
+mod live;
 mod locate_skill;
 mod plan;
 mod process;
@@ -53,7 +54,7 @@ use ua_component::{ComponentPort, Options, made};
 use crate::cell::Cell;
 use crate::execution_skill::ExecuteProcess;
 use crate::locate_skill::LocateObject;
-use crate::settings::Settings;
+use crate::settings::{Connect, Settings};
 use crate::sources::Sources;
 
 /// The semantic MES: knows the components of the plant, answers questions about them, and runs processes with them.
@@ -356,6 +357,24 @@ impl UaMes {
         });
         let watcher =
             watcher.map_err(|fault| Failure::new(FailureKind::Unavailable, fault.to_string()))?;
+        for manifest in &ready.settings.manifests {
+            let endpoint = match &manifest.connect {
+                Connect::No => continue,
+                Connect::Yes => None,
+                Connect::At(endpoint) => Some(endpoint.clone()),
+            };
+            let module = live::WatchedModule {
+                name: manifest.source.name.clone(),
+                iri: manifest.iri.clone(),
+                endpoint,
+            };
+            let options = ready.cell.client().clone();
+            drop(tokio::spawn(live::module(
+                Arc::clone(&ready.knowledge),
+                options,
+                module,
+            )));
+        }
         drop(tokio::spawn(follow::follow(
             Arc::clone(&ready.cell),
             watcher,

@@ -470,7 +470,8 @@ impl Judging<'_> {
         let because = |why: String| Err(NotFit::Because(why));
         if !offer.is_skill {
             return because(
-                "it is a service of a module, and those are not run from here".to_owned(),
+                "it is a service in a manifest; `ua-component` with `device: {mtp: ..}` runs it as a skill"
+                    .to_owned(),
             );
         }
         if let (false, Some(wanted)) = (has_capability, &need.capability) {

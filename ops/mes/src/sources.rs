@@ -140,12 +140,21 @@ impl Sources {
         manifest: &Manifest,
         lasting: Lasting,
     ) -> Result<(), String> {
-        let module = Module::from_bytes(bytes).map_err(|fault| fault.to_string())?;
+        let folder = manifest.source.path.parent();
+        let mut beside = |name: &str| {
+            // A manifest that was sent has no folder.
+            let path = folder.filter(|_| lasting == Lasting::No)?.join(name);
+            bridge_node::read_bounded(&path, LARGEST).ok()
+        };
+        let module = Module::from_files(bytes, &mut beside).map_err(|fault| fault.to_string())?;
         let triples = module.triples(&manifest.iri, &manifest.capabilities);
         self.put(source, &triples, lasting)?;
         for found in &module.findings {
-            let what = format!("{}: {}", found.about, found.what);
-            warn!(manifest = source.name, "{what}");
+            let what = found.to_string();
+            match found.is_note {
+                true => info!(manifest = source.name, "{what}"),
+                false => warn!(manifest = source.name, "{what}"),
+            }
             let found = finding(source, what, false);
             self.state()
                 .findings
@@ -261,6 +270,7 @@ impl SourceFiles for Sources {
                     },
                     iri: format!("urn:ua-bridge:mtp:{}", escaped(name)),
                     capabilities: BTreeMap::new(),
+                    connect: settings::Connect::No,
                 };
                 self.module(&source, contents, &manifest, Lasting::Yes)?;
             }

@@ -4,6 +4,7 @@ mod cell;
 mod discover;
 mod live;
 mod recording;
+mod module;
 mod write;
 
 pub(crate) use cell::{Doctor, DriverTemplate, New, StatusArguments, Template};
@@ -14,6 +15,8 @@ pub(crate) use live::{
 };
 pub(crate) use recording::{Record, Replay, Viewers};
 pub(crate) use write::Write;
+
+pub(crate) use module::{MtpArguments, MtpRdf, MtpSkills, MtpVerb, PeaArguments};
 
 use std::path::PathBuf;
 
@@ -284,6 +287,22 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 65 a file is no NodeSet, 74 a file cannot be read or the output cannot
     /// be written.
     Owl(Owl),
+    /// Read manifests of process modules (MTP): check, skills, RDF
+    ///
+    /// Documents that a manifest refers to are read from its folder or its container.
+    ///
+    /// Exit codes: 0 done, with or without notes, 64 usage, 65 a file is no manifest, or an element
+    /// is inconsistent, 74 a file cannot be read or the output cannot be written.
+    Mtp(MtpArguments),
+    /// Simulate the process module (PEA) of a manifest as an OPC UA server
+    ///
+    /// Serves all nodes of the manifest, with modes, the state machines of the services and their
+    /// parameters, until SIGINT or SIGTERM. Options make it deviate from the standard, as modules
+    /// in the field do.
+    ///
+    /// Exit codes: 0 ended by a signal, 64 usage, 65 the file is no manifest, 69 the address is not
+    /// available, 74 the file cannot be read.
+    Pea(PeaArguments),
     /// Print the completion script of a shell, which also completes names of skills and topics
     ///
     /// For bash: `source <(ua-space completion bash)`; for zsh likewise; for fish: `ua-space

@@ -27,10 +27,12 @@ mod live;
 mod make_keys;
 mod messages;
 mod metadata;
+mod mtp_files;
 mod new;
 mod owl;
 mod packet;
 mod page;
+mod pea;
 mod raw_data;
 mod report;
 mod rml;
@@ -102,6 +104,8 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Source(arguments) => source::source(arguments),
         Verb::Rml(arguments) => rml::rml(arguments),
         Verb::Owl(arguments) => owl::owl(arguments),
+        Verb::Mtp(arguments) => mtp_files::mtp(arguments),
+        Verb::Pea(arguments) => pea::pea(arguments),
         Verb::Completion(arguments) => completion::script(arguments.shell),
         Verb::Complete(arguments) => completion::complete(&arguments.words),
     };

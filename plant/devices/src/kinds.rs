@@ -1,5 +1,6 @@
 //! Reads the device of a component from YAML.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -7,19 +8,20 @@ use skills::yaml::{Code, Node, Reader};
 use skills::{Device, DeviceKinds, Driver, SensorRead};
 
 use crate::line::Line;
-use crate::{http_skill, kelvin, robotiq, schmalz, sensors, ur};
+use crate::{http_skill, kelvin, module, robotiq, schmalz, sensors, ur};
 
 /// The devices of this crate.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Kinds;
 
 impl DeviceKinds for Kinds {
-    fn read(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
+    fn read(&self, node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
         match reader.map(node, NAMES)? {
-            [Some(node), None, None, None] => read_robotiq(node, reader),
-            [None, Some(node), None, None] => read_schmalz(node, reader),
-            [None, None, Some(node), None] => read_robot(node, reader),
-            [None, None, None, Some(node)] => read_changer(node, reader),
+            [Some(node), None, None, None, None] => read_robotiq(node, reader),
+            [None, Some(node), None, None, None] => read_schmalz(node, reader),
+            [None, None, Some(node), None, None] => read_robot(node, reader),
+            [None, None, None, Some(node), None] => read_changer(node, reader),
+            [None, None, None, None, Some(node)] => module::read(node, folder, reader),
             _ => {
                 let message = format!("a device is exactly one of {}", NAMES.join(", "));
                 reader.refuse(node, Code::Driver, message)
@@ -36,11 +38,12 @@ impl DeviceKinds for Kinds {
     }
 }
 
-const NAMES: [&str; 4] = [
+const NAMES: [&str; 5] = [
     "robotiq_2f85",
     "schmalz_ecbpi",
     "universal_robot",
     "kelvin_tool_changer",
+    "mtp",
 ];
 
 fn read_robotiq(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {

@@ -5,7 +5,8 @@
 //! their software with it (`ua-component simulate`).
 //!
 //! Reading order: [`line`](Line) (the address of a device), `modbus` (the client), [`robotiq`],
-//! [`schmalz`], [`ur`], [`kelvin`] (which moves a robot), `sensors` (values without skills).
+//! [`schmalz`], [`ur`], [`kelvin`] (which moves a robot), [`module`] (services of process modules),
+//! `sensors` (values without skills).
 
 #[cfg(test)]
 mod contact_tests;
@@ -15,6 +16,7 @@ pub mod kelvin;
 mod kinds;
 mod line;
 mod modbus;
+pub mod module;
 pub mod robotiq;
 pub mod schmalz;
 mod sensors;

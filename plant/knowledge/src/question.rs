@@ -76,6 +76,10 @@ pub enum QuestionFault {
 /// All questions, by their names.
 pub const QUESTIONS: &[Question] = &[
     Question {
+        name: "access-of",
+        sparql: include_str!("../queries/access-of.rq"),
+    },
+    Question {
         name: "candidates",
         sparql: include_str!("../queries/candidates.rq"),
     },
@@ -88,12 +92,28 @@ pub const QUESTIONS: &[Question] = &[
         sparql: include_str!("../queries/components.rq"),
     },
     Question {
+        name: "components-of",
+        sparql: include_str!("../queries/components-of.rq"),
+    },
+    Question {
+        name: "modules-with",
+        sparql: include_str!("../queries/modules-with.rq"),
+    },
+    Question {
         name: "objects",
         sparql: include_str!("../queries/objects.rq"),
     },
     Question {
+        name: "outputs-of",
+        sparql: include_str!("../queries/outputs-of.rq"),
+    },
+    Question {
         name: "parameters",
         sparql: include_str!("../queries/parameters.rq"),
+    },
+    Question {
+        name: "parameters-of",
+        sparql: include_str!("../queries/parameters-of.rq"),
     },
     Question {
         name: "process-parameters",
@@ -120,12 +140,28 @@ pub const QUESTIONS: &[Question] = &[
         sparql: include_str!("../queries/runs.rq"),
     },
     Question {
+        name: "services-of",
+        sparql: include_str!("../queries/services-of.rq"),
+    },
+    Question {
         name: "skills",
         sparql: include_str!("../queries/skills.rq"),
     },
     Question {
+        name: "skills-for",
+        sparql: include_str!("../queries/skills-for.rq"),
+    },
+    Question {
         name: "sources",
         sparql: include_str!("../queries/sources.rq"),
+    },
+    Question {
+        name: "state-of",
+        sparql: include_str!("../queries/state-of.rq"),
+    },
+    Question {
+        name: "transitions-now",
+        sparql: include_str!("../queries/transitions-now.rq"),
     },
     Question {
         name: "types",

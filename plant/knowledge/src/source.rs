@@ -31,6 +31,8 @@ pub enum SourceKind {
     Process,
     /// A run of a process.
     Run,
+    /// The current states of the skills of a component or a module, by its name.
+    State,
     /// A graph that users write; its name is its IRI.
     Graph,
     /// The results of the rules, which are read-only.
@@ -69,6 +71,7 @@ impl fmt::Display for SourceKind {
             Self::File => "file",
             Self::Process => "process",
             Self::Run => "run",
+            Self::State => "state",
             Self::Graph => "graph",
             Self::Derived => "derived",
         })

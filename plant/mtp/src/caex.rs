@@ -48,6 +48,9 @@ pub(crate) struct Element {
     pub(crate) id: String,
     /// RefBaseSystemUnitPath, or RefBaseClassPath of an interface.
     pub(crate) path: String,
+    /// The line of its start, from 1.
+    pub(crate) line: usize,
+    pub(crate) is_interface: bool,
     pub(crate) attributes: Vec<Attribute>,
     pub(crate) children: Vec<Self>,
 }
@@ -58,6 +61,9 @@ pub(crate) struct Attribute {
     pub(crate) name: String,
     pub(crate) data_type: String,
     pub(crate) value: String,
+    pub(crate) id: String,
+    /// Whether its value is the ID of an element, by its type.
+    pub(crate) is_link: bool,
 }
 
 impl Element {
@@ -73,14 +79,19 @@ impl Element {
         let mut reader = Reader::from_str(file);
         reader.config_mut().expand_empty_elements = true;
         let mut building = Building::default();
+        let mut lines = Lines::new(file);
         loop {
+            let start = reader.buffer_position();
             let event = reader.read_event();
             let fault = |what: String| ManifestError::Xml {
                 line: line(file, reader.buffer_position()),
                 what,
             };
             match event.map_err(|error| fault(error.to_string()))? {
-                Event::Start(start) => building.open(&start).map_err(fault)?,
+                Event::Start(element) => {
+                    let line = lines.at(start);
+                    building.open(&element, line).map_err(fault)?;
+                }
                 Event::End(_) => building.close(),
                 Event::Text(text) => building.text(&text.xml10_content()),
                 Event::CData(text) => building.text(&text.xml10_content()),
@@ -155,7 +166,7 @@ enum Part {
 }
 
 impl Building {
-    fn open(&mut self, start: &BytesStart<'_>) -> Result<(), String> {
+    fn open(&mut self, start: &BytesStart<'_>, line: usize) -> Result<(), String> {
         if self.open.len() >= MAX_DEPTH {
             return Err(format!("elements nest more than {MAX_DEPTH} deep"));
         }
@@ -175,7 +186,8 @@ impl Building {
                 .map(Cow::into_owned)
                 .map_err(|error| error.to_string())
         };
-        let part = match start.local_name().into_inner() {
+        let tag = start.local_name().into_inner();
+        let part = match tag {
             "CAEXFile" | "InstanceHierarchy" | "InternalElement" | "ExternalInterface" => {
                 let mut path = text("RefBaseSystemUnitPath")?;
                 if path.is_empty() {
@@ -185,14 +197,20 @@ impl Building {
                     name: text("Name")?,
                     id: text("ID")?,
                     path,
+                    line,
+                    is_interface: tag == "ExternalInterface",
                     ..Element::default()
                 })
             }
             "Attribute" if matches!(self.open.last(), Some(Part::Element(_))) => {
+                let data_type = text("AttributeDataType")?;
+                let link_type = text("RefAttributeType")?;
                 Part::Attribute(Attribute {
                     name: text("Name")?,
-                    data_type: text("AttributeDataType")?,
                     value: String::new(),
+                    id: text("ID")?,
+                    is_link: data_type.ends_with(":IDREF") || link_type.ends_with(ID_LINK),
+                    data_type,
                 })
             }
             "Value" if matches!(self.open.last(), Some(Part::Attribute(_))) => Part::Value,
@@ -231,6 +249,35 @@ impl Building {
     }
 }
 
+/// Counts the lines of ascending positions, each byte once.
+struct Lines<'f> {
+    rest: &'f [u8],
+    position: u64,
+    line: usize,
+}
+
+impl<'f> Lines<'f> {
+    fn new(file: &'f str) -> Self {
+        Self {
+            rest: file.as_bytes(),
+            position: 0,
+            line: 1,
+        }
+    }
+
+    fn at(&mut self, position: u64) -> usize {
+        let passed = usize::try_from(position.saturating_sub(self.position)).unwrap_or(usize::MAX);
+        let (before, rest) = self
+            .rest
+            .split_at_checked(passed)
+            .unwrap_or((self.rest, &[]));
+        self.line += before.iter().filter(|byte| **byte == b'\n').count();
+        self.rest = rest;
+        self.position = position;
+        self.line
+    }
+}
+
 fn line(file: &str, position: u64) -> usize {
     let position = usize::try_from(position)
         .unwrap_or(usize::MAX)
@@ -239,6 +286,8 @@ fn line(file: &str, position: u64) -> usize {
     before.iter().filter(|byte| **byte == b'\n').count() + 1
 }
 
+/// The type of attributes of CAEX 3.0 whose value is the ID of an element.
+const ID_LINK: &str = "/IDLinkAttributeType";
 /// The largest of the available manifests has 0.8 MB.
 pub(crate) const MAX_FILE: usize = 64 << 20;
 const MAX_DEPTH: usize = 64;

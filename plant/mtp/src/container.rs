@@ -45,6 +45,21 @@ pub(crate) fn document(file: &[u8]) -> Result<Vec<u8>, ManifestError> {
     unpack(file, chosen)
 }
 
+/// Returns the document with a path, or with the name at the end of the path.
+///
+/// # Errors
+/// [`ManifestError::Container`] if the archive is damaged.
+pub(crate) fn named(file: &[u8], path: &str) -> Result<Option<Vec<u8>>, ManifestError> {
+    let members = members(file)?;
+    let name = format!("/{}", path.rsplit('/').next().unwrap_or_default());
+    let exact = members.iter().find(|one| one.path == path);
+    let found = exact.or_else(|| {
+        let mut members = members.iter();
+        members.find(|one| format!("/{}", one.path).ends_with(&name))
+    });
+    found.map(|one| unpack(file, one)).transpose()
+}
+
 /// A file in an archive.
 struct Member {
     path: String,

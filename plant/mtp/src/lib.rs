@@ -9,20 +9,27 @@
 //! (2.15, 3.0) and in references (by RefID or by ID). The model has a single name for each concept.
 //! An inconsistency in a file is a [`Finding`], and the rest of the file is used.
 //!
-//! [`Module::triples`] returns the same as RDF, in the terms of [`vocabulary`].
+//! [`Module::triples`] returns the same as RDF, in the terms of [`vocabulary`]. [`state`] is the
+//! state machine of services, and [`pea::Pea`] simulates the module of a manifest.
 //!
 //! This crate opens no file and calls no server.
 
 mod caex;
 mod container;
+mod elements;
 mod model;
+pub mod pea;
 mod rdf;
+mod rdf_module;
 mod read;
+pub mod state;
 pub mod vocabulary;
 
 pub use caex::ManifestError;
 pub use model::{
-    Access, Bound, Control, Finding, Identifier, Module, Node, Parameter, Procedure, Role, Service,
-    ValueKind,
+    Access, Alarm, Bound, Control, DataAssembly, Edition, Family, Finding, Identifier, Item, Link,
+    Module, Node, OpcUaServer, Output, OutputRole, Parameter, Procedure, Role, Service, ValueKind,
+    Variable,
 };
-pub use rdf::{Object, Triple, escaped};
+pub use rdf::{Object, Triple, escaped, unit_symbol};
+pub use rdf_module::state_iri;

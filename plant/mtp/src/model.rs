@@ -9,21 +9,180 @@ pub struct Module {
     pub name: String,
     /// Its version; empty if unknown.
     pub version: String,
+    /// The edition of the standard that the file follows.
+    pub edition: Edition,
     /// The endpoints of its OPC UA servers.
     pub endpoints: Vec<String>,
+    /// Its OPC UA servers.
+    pub servers: Vec<OpcUaServer>,
+    /// All nodes of its servers (OPCUAItems).
+    pub items: Vec<Item>,
+    /// All data assemblies: sensors, actuators, parameters, services.
+    pub assemblies: Vec<DataAssembly>,
+    /// The values that the module exchanges with other modules.
+    pub process_values: Vec<Output>,
+    /// Its alarms (MTP 2.0).
+    pub alarms: Vec<Alarm>,
     /// Its services, in the order of the file.
     pub services: Vec<Service>,
     /// Inconsistencies in the file.
     pub findings: Vec<Finding>,
 }
 
-/// An inconsistency; its element is not in the model.
+/// The edition of the standard of a manifest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Edition {
+    /// VDI/VDE/NAMUR 2658 and its drafts, MTP 1.x.
+    V1,
+    /// MTP 2.0, with a hierarchy for each aspect.
+    V2,
+}
+
+/// An element that is not in the model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
     /// The element, such as `Dosing/volume_based`.
     pub about: String,
     /// Description of the inconsistency.
     pub what: String,
+    /// The line of the element, from 1.
+    pub line: usize,
+    /// Whether the file is consistent, and the element has no place in the model, such as a
+    /// picture.
+    pub is_note: bool,
+}
+
+impl std::fmt::Display for Finding {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "line {}: {}: {}", self.line, self.about, self.what)
+    }
+}
+
+/// An OPC UA server of a module.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct OpcUaServer {
+    /// Unique in the file.
+    pub id: String,
+    /// Its name.
+    pub name: String,
+    /// Its endpoint; empty if the file has none.
+    pub endpoint: String,
+}
+
+/// A node of a server, as the file names it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Item {
+    /// Its name in the file.
+    pub name: String,
+    /// The node, with its ID in the file.
+    pub node: Node,
+}
+
+/// A data assembly: the variables of a sensor, an actuator, a parameter or a service.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DataAssembly {
+    /// Unique in the file.
+    pub id: String,
+    /// Its name.
+    pub name: String,
+    /// Its most derived type, such as `AnaView` or `MonBinVlv`.
+    pub kind: String,
+    /// The family of its type.
+    pub family: Family,
+    /// Its variables in the order of the file.
+    pub variables: Vec<Variable>,
+}
+
+/// A family of data assemblies (VDI/VDE/NAMUR 2658-3).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Family {
+    /// IndicatorElement: a sensor.
+    Sensor,
+    /// ActiveElement: an actuator or a controller.
+    Actuator,
+    /// OperationElement and service parameters.
+    Parameter,
+    /// InputElement: a value from another module.
+    Input,
+    /// ServiceControl.
+    Service,
+    /// DiagnosticElement, such as the health of a procedure.
+    Diagnostic,
+    /// PeaElement: information about the module.
+    Information,
+    /// A type without a family.
+    Other,
+}
+
+/// A variable of a data assembly.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Variable {
+    /// Its name, such as `V` or `VSclMax`.
+    pub name: String,
+    /// A node, or a value in the file.
+    pub link: Link,
+}
+
+/// The value of a variable of a data assembly.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Link {
+    /// A node.
+    Node(Node),
+    /// A value in the file.
+    Constant(String),
+}
+
+/// An output value of a procedure or a service, or a value that a module exchanges with others.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Output {
+    /// Unique in the file.
+    pub id: String,
+    /// Its name.
+    pub name: String,
+    /// Its use.
+    pub role: OutputRole,
+    /// Its kind.
+    pub kind: ValueKind,
+    /// The data assembly with its variables.
+    pub assembly: String,
+    /// Minimum value of its scale.
+    pub min: Option<Bound>,
+    /// Maximum value of its scale.
+    pub max: Option<Bound>,
+    /// The number of its unit, or the node with that number.
+    pub unit: Option<Bound>,
+    /// The node with the value.
+    pub node: Option<Node>,
+}
+
+/// The use of an output.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum OutputRole {
+    /// A report value.
+    Report,
+    /// A process value that other modules read.
+    ProcessValueOut,
+    /// A process value that the module reads from another module.
+    ProcessValueIn,
+}
+
+/// An alarm of a module (MTP 2.0).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Alarm {
+    /// Unique in the file.
+    pub id: String,
+    /// Its name.
+    pub name: String,
+    /// The text for operators; empty if the file has none.
+    pub text: String,
+    /// From 1 to 1000.
+    pub severity: Option<u16>,
+    /// Whether an operator acknowledges it.
+    pub is_acknowledged: bool,
+    /// The node that triggers it.
+    pub trigger: Option<Node>,
+    /// The value of the node that triggers it; empty if the file has none.
+    pub trigger_value: String,
 }
 
 /// A service, which runs one of its procedures at a time (VDI/VDE/NAMUR 2658-4).
@@ -37,6 +196,10 @@ pub struct Service {
     pub control: Control,
     /// Parameters of the service itself.
     pub parameters: Vec<Parameter>,
+    /// Output values of the service itself.
+    pub outputs: Vec<Output>,
+    /// The IDs of the equipment that the service requires.
+    pub equipment: Vec<String>,
     /// Its procedures.
     pub procedures: Vec<Procedure>,
 }
@@ -56,6 +219,10 @@ pub struct Procedure {
     pub is_self_completing: bool,
     /// Its parameters.
     pub parameters: Vec<Parameter>,
+    /// Its output values.
+    pub outputs: Vec<Output>,
+    /// The IDs of the equipment that the procedure requires.
+    pub equipment: Vec<String>,
 }
 
 /// An input value of a service or procedure.
@@ -65,6 +232,8 @@ pub struct Parameter {
     pub id: String,
     /// Its name.
     pub name: String,
+    /// Whether it belongs to the configuration of the service, in place of a recipe.
+    pub is_configuration: bool,
     /// Its kind.
     pub kind: ValueKind,
     /// Minimum value.
@@ -77,6 +246,8 @@ pub struct Parameter {
     pub write: Option<Node>,
     /// The node for reading the effective value (VOut).
     pub read: Option<Node>,
+    /// The nodes of the handshake (Apply, mode and source), by the names of the standard.
+    pub handshake: Vec<(String, Node)>,
 }
 
 /// The kind of a parameter.
@@ -138,11 +309,31 @@ pub enum Role {
     ExternalByAutomation,
     /// WQC: the quality of the values.
     Quality,
+    /// SrcChannel: services select the source of values by themselves.
+    SourceChannel,
+    /// StateChannel: the orchestrating system selects the mode.
+    ModeChannel,
+    /// ProcParamApplyEn: parameters of the procedure can be applied.
+    ApplyEnabled,
+    /// ProcParamApplyExt: applies the parameters of the procedure.
+    ApplyByExternal,
+    /// ConfigParamApplyEn: parameters of the configuration can be applied.
+    ConfigurationApplyEnabled,
+    /// ConfigParamApplyExt: applies the parameters of the configuration.
+    ConfigurationApplyByExternal,
+    /// InteractQuestionID: a question of the service to the operator.
+    Question,
+    /// InteractAnswerID: the answer to the question.
+    Answer,
+    /// PosTextID: the number of a text about the progress.
+    Text,
 }
 
 /// A node of an OPC UA server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Node {
+    /// The ID of its OPCUAItem in the file.
+    pub item: String,
     /// The endpoint of its server.
     pub endpoint: String,
     /// The URI of its namespace, or the namespace index that some files have in its place.
@@ -169,6 +360,39 @@ pub struct Access {
     pub reads: bool,
     /// Whether the node can be written.
     pub writes: bool,
+}
+
+impl DataAssembly {
+    /// Returns the variable of a name.
+    #[must_use]
+    pub fn variable(&self, name: &str) -> Option<&Variable> {
+        self.variables.iter().find(|one| one.name == name)
+    }
+
+    /// Returns the node of the first existing variable with one of these names.
+    #[must_use]
+    pub fn node(&self, names: &[&str]) -> Option<&Node> {
+        let found = names.iter().find_map(|name| self.variable(name))?;
+        match &found.link {
+            Link::Node(node) => Some(node),
+            Link::Constant(_) => None,
+        }
+    }
+
+    /// Returns the kind of its value; `None` for data assemblies without a single value.
+    #[must_use]
+    pub fn value_kind(&self) -> Option<ValueKind> {
+        let is = |part: &str| self.kind.contains(part);
+        let is_active = matches!(self.family, Family::Actuator | Family::Service);
+        match () {
+            () if is_active => None,
+            () if is("DInt") || is("Dig") => Some(ValueKind::Integer),
+            () if is("Ana") => Some(ValueKind::Analog),
+            () if is("Bin") => Some(ValueKind::Binary),
+            () if is("Str") => Some(ValueKind::Text),
+            () => None,
+        }
+    }
 }
 
 impl Control {

@@ -6,11 +6,13 @@
 //! the same name in a module, are therefore distinct.
 
 use std::collections::{BTreeMap, HashSet};
-use std::fmt::Write as _;
+use std::fmt::{self, Write as _};
 
 use crate::model::{
-    Bound, Identifier, Module, Node, Parameter, Procedure, Role, Service, ValueKind,
+    Access, Bound, Edition, Identifier, Module, Node, Parameter, Procedure, Role, Service,
+    ValueKind,
 };
+use crate::state::Command;
 use crate::vocabulary as v;
 
 /// A statement.
@@ -39,6 +41,60 @@ pub enum Object {
     Boolean(bool),
     /// An xsd:dateTime in its lexical form.
     Time(String),
+}
+
+impl Object {
+    /// Returns its lexical form.
+    #[must_use]
+    pub fn lexical(&self) -> String {
+        match self {
+            Self::Iri(text) | Self::Text(text) | Self::Time(text) => text.clone(),
+            Self::Integer(number) => number.to_string(),
+            // The exponent makes the text an xsd:double in Turtle too.
+            Self::Number(number) => format!("{number:E}"),
+            Self::Boolean(value) => value.to_string(),
+        }
+    }
+
+    /// Returns the IRI of its datatype; `None` for an IRI and for an xsd:string.
+    #[must_use]
+    pub const fn datatype(&self) -> Option<&'static str> {
+        match self {
+            Self::Iri(_) | Self::Text(_) => None,
+            Self::Integer(_) => Some("http://www.w3.org/2001/XMLSchema#integer"),
+            Self::Number(_) => Some("http://www.w3.org/2001/XMLSchema#double"),
+            Self::Boolean(_) => Some("http://www.w3.org/2001/XMLSchema#boolean"),
+            Self::Time(_) => Some("http://www.w3.org/2001/XMLSchema#dateTime"),
+        }
+    }
+}
+
+/// The statement as a line of N-Triples, without the end of the line.
+impl fmt::Display for Triple {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "<{}> <{}> ", self.subject, self.predicate)?;
+        match (&self.object, self.object.datatype()) {
+            (Object::Iri(iri), _) => write!(f, "<{iri}> ."),
+            (object, datatype) => {
+                f.write_str("\"")?;
+                for c in object.lexical().chars() {
+                    match c {
+                        '"' => f.write_str("\\\"")?,
+                        '\\' => f.write_str("\\\\")?,
+                        '\n' => f.write_str("\\n")?,
+                        '\r' => f.write_str("\\r")?,
+                        '\t' => f.write_str("\\t")?,
+                        c if c.is_control() => write!(f, "\\u{:04X}", u32::from(c))?,
+                        c => write!(f, "{c}")?,
+                    }
+                }
+                match datatype {
+                    Some(datatype) => write!(f, "\"^^<{datatype}> ."),
+                    None => f.write_str("\" ."),
+                }
+            }
+        }
+    }
 }
 
 impl Module {
@@ -94,8 +150,8 @@ impl Node {
     }
 }
 
-impl std::fmt::Display for Identifier {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl fmt::Display for Identifier {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Numeric(number) => write!(f, "i={number}"),
             Self::Text(text) => write!(f, "s={text}"),
@@ -103,7 +159,8 @@ impl std::fmt::Display for Identifier {
     }
 }
 
-struct Graph<'a> {
+/// The statements about a module.
+pub(crate) struct Graph<'a> {
     base: &'a str,
     all: Vec<Triple>,
     taken: HashSet<String>,
@@ -114,14 +171,20 @@ impl Graph<'_> {
     fn module(&mut self, module: &Module) {
         let iri = self.base.to_owned();
         self.taken.insert(iri.clone());
-        self.is_a(&iri, &[v::RESOURCE, v::MODULE]);
+        self.is_a(&iri, &[v::RESOURCE, v::MODULE, v::PAPER_MODULE]);
         self.text(&iri, v::RDFS_LABEL, &module.name);
+        let edition = match module.edition {
+            Edition::V1 => "1",
+            Edition::V2 => "2.0",
+        };
+        self.text(&iri, v::EDITION, edition);
         if !module.version.is_empty() {
             self.text(&iri, v::VERSION, &module.version);
         }
         for endpoint in &module.endpoints {
             self.text(&iri, v::ENDPOINT, endpoint);
         }
+        self.whole(&iri, module);
         for service in &module.services {
             self.service(&iri, service);
         }
@@ -130,7 +193,8 @@ impl Graph<'_> {
     fn service(&mut self, module: &str, service: &Service) {
         let iri = self.name(module, "service", &service.id, &service.name);
         self.link(module, v::OFFERS_SERVICE, &iri);
-        self.is_a(&iri, &[v::SERVICE]);
+        self.link(module, v::PAPER_HAS_CAPABILITY, &iri);
+        self.is_a(&iri, &[v::SERVICE, v::PAPER_PROCESS, v::PAPER_CAPABILITY]);
         self.text(&iri, v::RDFS_LABEL, &service.name);
         for (role, node) in &service.control.0 {
             let node_iri = format!("{iri}/node/{role:?}");
@@ -145,6 +209,9 @@ impl Graph<'_> {
             self.node(&node_iri, node);
         }
         let commands = self.commands(&iri, service);
+        let machine = self.state_machine(&iri, service, &commands);
+        let variables = self.service_variables(&iri, service);
+        let outputs = self.outputs(&iri, &service.name, &service.outputs);
         let class = format!("{iri}/capability");
         self.link(&class, v::RDFS_SUB_CLASS_OF, v::CAPABILITY);
         self.text(&class, v::RDFS_LABEL, &service.name);
@@ -158,26 +225,43 @@ impl Graph<'_> {
             self.capability((module, &skill), &class, service, procedure);
             for parameter in &shared {
                 self.link(&skill, v::HAS_INPUT_PARAMETER, parameter);
+                self.link(&skill, v::PAPER_HAS_PARAMETER, parameter);
             }
-            for command in &commands {
+            for (_, command) in &commands {
                 self.link(&skill, v::HAS_SKILL_COMMAND, command);
+                self.link(&skill, v::PAPER_HAS_COMMAND, command);
+            }
+            self.link(&skill, v::BEHAVIOR_CONFORMS_TO, &machine);
+            self.link(&skill, v::PAPER_HAS_STATE_MACHINE, &machine);
+            for (predicate, variable) in &variables {
+                self.link(&skill, predicate, variable);
+            }
+            for output in &outputs {
+                self.link(&skill, v::HAS_OUTPUT_PARAMETER, output);
+                self.link(&skill, v::PAPER_HAS_OUTPUT, output);
+            }
+            let equipment = service.equipment.iter().chain(&procedure.equipment);
+            for id in equipment {
+                let element = self.element_iri(id);
+                self.link(&skill, v::REQUIRES_EQUIPMENT, &element);
             }
         }
     }
 
     /// Adds the commands of a procedure: a number for each command, written to the same node.
-    fn commands(&mut self, service_iri: &str, service: &Service) -> Vec<String> {
+    fn commands(&mut self, service_iri: &str, service: &Service) -> Vec<(Command, String)> {
         let Some(node) = service.control.node(Role::Command) else {
             return Vec::new();
         };
         let mut commands = Vec::new();
-        for (name, value) in COMMANDS {
-            let iri = format!("{service_iri}/command/{name}");
-            self.is_a(&iri, &[v::SKILL_COMMAND]);
-            self.text(&iri, v::RDFS_LABEL, name);
-            self.say(&iri, v::COMMAND_VALUE, Object::Integer(*value));
+        for command in Command::ALL {
+            let iri = format!("{service_iri}/command/{command}");
+            self.is_a(&iri, &[v::SKILL_COMMAND, v::PAPER_SKILL_COMMAND]);
+            self.text(&iri, v::RDFS_LABEL, command.name());
+            let value = Object::Integer(command.bit().into());
+            self.say(&iri, v::COMMAND_VALUE, value);
             self.node(&iri, node);
-            commands.push(iri);
+            commands.push((*command, iri));
         }
         commands
     }
@@ -191,7 +275,9 @@ impl Graph<'_> {
         let iri = self.name(service_iri, "procedure", &procedure.id, &procedure.name);
         self.link(module, v::PROVIDES_SKILL, &iri);
         self.link(service_iri, v::HAS_PROCEDURE, &iri);
-        self.is_a(&iri, &[v::SKILL, v::PROCEDURE]);
+        self.link(module, v::PAPER_PROVIDES_SKILL, &iri);
+        self.link(service_iri, v::PAPER_IS_EXECUTABLE_VIA, &iri);
+        self.is_a(&iri, &[v::SKILL, v::PROCEDURE, v::PAPER_SKILL]);
         self.text(
             &iri,
             v::RDFS_LABEL,
@@ -215,6 +301,11 @@ impl Graph<'_> {
         for parameter in &procedure.parameters {
             let parameter = self.parameter(&iri, &about, parameter);
             self.link(&iri, v::HAS_INPUT_PARAMETER, &parameter);
+            self.link(&iri, v::PAPER_HAS_PARAMETER, &parameter);
+        }
+        for output in self.outputs(&iri, &about, &procedure.outputs) {
+            self.link(&iri, v::HAS_OUTPUT_PARAMETER, &output);
+            self.link(&iri, v::PAPER_HAS_OUTPUT, &output);
         }
         iri
     }
@@ -244,45 +335,82 @@ impl Graph<'_> {
         }
     }
 
+    /// Returns the IRI of a data assembly by its ID.
+    pub(crate) fn element_iri(&self, id: &str) -> String {
+        format!("{}/element/{}", self.base, escaped(id))
+    }
+
     fn parameter(&mut self, of: &str, about: &str, parameter: &Parameter) -> String {
         let iri = self.name(of, "parameter", &parameter.id, &parameter.name);
-        self.is_a(&iri, &[v::INPUT_PARAMETER]);
+        self.is_a(&iri, &[v::INPUT_PARAMETER, v::PAPER_SKILL_PARAMETER]);
         self.text(&iri, v::RDFS_LABEL, &format!("{about}.{}", parameter.name));
         self.text(&iri, v::HAS_VARIABLE_NAME, &parameter.name);
         self.text(&iri, v::HAS_VARIABLE_TYPE, parameter.kind.data_type());
         // The module keeps the last given value, and starts with an initial value.
         self.say(&iri, v::IS_REQUIRED, Object::Boolean(false));
-        for (bound, predicate) in [(&parameter.min, v::MIN), (&parameter.max, v::MAX)] {
-            if let Some(Bound::Constant(number)) = bound {
-                self.say(&iri, predicate, Object::Number(*number));
-            }
-        }
-        if let Some(Bound::Constant(code)) = parameter.unit {
-            self.unit(&iri, code);
-        }
+        let kind = match parameter.is_configuration {
+            true => "configuration",
+            false => "procedure",
+        };
+        self.text(&iri, v::PARAMETER_KIND, kind);
         if let Some(node) = &parameter.write {
             self.node(&iri, node);
         }
-        let others = [
-            ("Read", parameter.read.as_ref()),
-            ("Min", bound_node(parameter.min.as_ref())),
-            ("Max", bound_node(parameter.max.as_ref())),
-            ("Unit", bound_node(parameter.unit.as_ref())),
-        ];
-        for (role, node) in others {
-            let Some(node) = node else { continue };
-            let node_iri = format!("{iri}/node/{role}");
-            self.link(&iri, v::HAS_NODE, &node_iri);
-            self.is_a(&node_iri, &[v::NODE]);
-            self.text(
-                &node_iri,
-                v::RDFS_LABEL,
-                &format!("{about}.{}.{role}", parameter.name),
-            );
-            self.text(&node_iri, v::ROLE, role);
-            self.node(&node_iri, node);
+        let about = format!("{about}.{}", parameter.name);
+        let scale = [&parameter.min, &parameter.max, &parameter.unit];
+        self.scale(&iri, &about, scale);
+        if let Some(node) = &parameter.read {
+            self.part(&iri, &about, "Read", node);
+        }
+        for (role, node) in &parameter.handshake {
+            self.part(&iri, &about, role, node);
         }
         iri
+    }
+
+    /// Adds the limits and the unit of a parameter or an output: numbers, or nodes.
+    pub(crate) fn scale(&mut self, of: &str, about: &str, scale: [&Option<Bound>; 3]) {
+        let [min, max, unit] = scale;
+        for (bound, predicate, role) in [(min, v::MIN, "Min"), (max, v::MAX, "Max")] {
+            match bound {
+                Some(Bound::Constant(number)) => {
+                    self.say(of, predicate, Object::Number(*number));
+                    self.constant(of, role, Object::Number(*number));
+                }
+                Some(Bound::Node(node)) => self.part(of, about, role, node),
+                None => {}
+            }
+        }
+        match unit {
+            Some(Bound::Constant(code)) => {
+                self.unit(of, *code);
+                self.constant(of, "Unit", Object::Number(*code));
+            }
+            Some(Bound::Node(node)) => self.part(of, about, "Unit", node),
+            None => {}
+        }
+    }
+
+    /// Adds a limit or unit whose value is in the file, for the capability model that has each as a
+    /// parameter of the skill.
+    fn constant(&mut self, of: &str, role: &str, value: Object) {
+        let iri = format!("{of}/constant/{role}");
+        self.is_a(&iri, &[v::PAPER_SKILL_PARAMETER]);
+        self.text(&iri, v::ROLE, role);
+        self.say(&iri, v::VALUE, value);
+    }
+
+    /// Adds a node of a parameter or an output beside its value.
+    fn part(&mut self, of: &str, about: &str, role: &str, node: &Node) {
+        let iri = format!("{of}/node/{role}");
+        self.link(of, v::HAS_NODE, &iri);
+        self.is_a(&iri, &[v::NODE]);
+        if matches!(role, "Min" | "Max" | "Unit") {
+            self.is_a(&iri, &[v::PAPER_SKILL_PARAMETER]);
+        }
+        self.text(&iri, v::RDFS_LABEL, &format!("{about}.{role}"));
+        self.text(&iri, v::ROLE, role);
+        self.node(&iri, node);
     }
 
     fn unit(&mut self, parameter: &str, code: f64) {
@@ -295,7 +423,9 @@ impl Graph<'_> {
         }
     }
 
-    fn node(&mut self, of: &str, node: &Node) {
+    /// Adds the location of a node, and the access to it.
+    pub(crate) fn node(&mut self, of: &str, node: &Node) {
+        self.text(of, v::ACCESS, node.access.name());
         self.text(of, v::ENDPOINT, &node.endpoint);
         self.text(of, v::NODE_NAMESPACE, &node.namespace);
         self.text(of, v::NODE_IDENTIFIER, &node.identifier.to_string());
@@ -304,7 +434,7 @@ impl Graph<'_> {
 
     /// Returns a unique IRI: from the ID, or from the name if there is no ID, with a number if it
     /// is taken.
-    fn name(&mut self, of: &str, kind: &str, id: &str, name: &str) -> String {
+    pub(crate) fn name(&mut self, of: &str, kind: &str, id: &str, name: &str) -> String {
         let part = escaped(if id.is_empty() { name } else { id });
         let mut iri = format!("{of}/{kind}/{part}");
         // A part never contains a comma.
@@ -317,21 +447,21 @@ impl Graph<'_> {
         iri
     }
 
-    fn is_a(&mut self, subject: &str, classes: &[&str]) {
+    pub(crate) fn is_a(&mut self, subject: &str, classes: &[&str]) {
         for class in classes {
             self.link(subject, v::RDF_TYPE, class);
         }
     }
 
-    fn link(&mut self, subject: &str, predicate: &str, object: &str) {
+    pub(crate) fn link(&mut self, subject: &str, predicate: &str, object: &str) {
         self.say(subject, predicate, Object::Iri(object.to_owned()));
     }
 
-    fn text(&mut self, subject: &str, predicate: &str, text: &str) {
+    pub(crate) fn text(&mut self, subject: &str, predicate: &str, text: &str) {
         self.say(subject, predicate, Object::Text(text.to_owned()));
     }
 
-    fn say(&mut self, subject: &str, predicate: &str, object: Object) {
+    pub(crate) fn say(&mut self, subject: &str, predicate: &str, object: Object) {
         self.all.push(Triple {
             subject: subject.to_owned(),
             predicate: predicate.to_owned(),
@@ -340,11 +470,25 @@ impl Graph<'_> {
     }
 }
 
-fn bound_node(bound: Option<&Bound>) -> Option<&Node> {
-    match bound {
-        Some(Bound::Node(node)) => Some(node),
-        Some(Bound::Constant(_)) | None => None,
+impl Access {
+    /// Returns its name: `read`, `write`, `read and write` or `none`.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match (self.reads, self.writes) {
+            (true, true) => "read and write",
+            (true, false) => "read",
+            (false, true) => "write",
+            (false, false) => "none",
+        }
     }
+}
+
+/// Returns the symbol of a unit by its number in VDI/VDE/NAMUR 2658-3, table 10.
+#[must_use]
+pub fn unit_symbol(code: f64) -> Option<&'static str> {
+    let mut known = UNITS.iter();
+    let found = known.find(|(known, _)| f64::from(*known) == code)?;
+    Some(found.1)
 }
 
 impl ValueKind {
@@ -359,20 +503,6 @@ impl ValueKind {
         }
     }
 }
-
-/// The bits of CommandExt (VDI/VDE/NAMUR 2658-4, table 14).
-const COMMANDS: &[(&str, i64)] = &[
-    ("Reset", 2),
-    ("Start", 4),
-    ("Stop", 8),
-    ("Hold", 16),
-    ("Unhold", 32),
-    ("Pause", 64),
-    ("Resume", 128),
-    ("Abort", 256),
-    ("Restart", 512),
-    ("Complete", 1024),
-];
 
 /// The most common units (VDI/VDE/NAMUR 2658-3, table 10). Other units have only their code.
 const UNITS: &[(u16, &str)] = &[

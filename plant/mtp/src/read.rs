@@ -1,27 +1,65 @@
 //! Converts the tree of elements to the model.
 
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use crate::caex::{Element, ManifestError};
 use crate::container;
+use crate::elements;
 use crate::model::{
-    Access, Bound, Control, Finding, Identifier, Module, Node, Parameter, Procedure, Role, Service,
-    ValueKind,
+    Access, Bound, Control, Edition, Finding, Identifier, Item, Module, Node, OpcUaServer,
+    Parameter, Procedure, Role, Service, ValueKind,
 };
 
 impl Module {
     /// Reads a manifest as delivered: an `.aml` file in any encoding of [`xml_text`], or a ZIP
-    /// container with such a file (`.mtp` or `.amlx`).
+    /// container with such a file (`.mtp` or `.amlx`). Other documents of a container that the
+    /// manifest refers to are read with it.
     ///
     /// # Errors
     /// [`ManifestError`] if the file is not a manifest.
     pub fn from_bytes(file: &[u8]) -> Result<Self, ManifestError> {
-        let unpacked = match container::is_container(file) {
+        Self::from_files(file, &mut |_| None)
+    }
+
+    /// Reads a manifest with the documents to which it refers by `refURI`. `fetch` returns a
+    /// document by its relative path; a container has its own documents.
+    ///
+    /// # Errors
+    /// [`ManifestError`] if the file is not a manifest, or another document is no CAEX file.
+    pub fn from_files(
+        file: &[u8],
+        fetch: &mut dyn FnMut(&str) -> Option<Vec<u8>>,
+    ) -> Result<Self, ManifestError> {
+        let is_container = container::is_container(file);
+        let unpacked = match is_container {
             true => Cow::Owned(container::document(file)?),
             false => Cow::Borrowed(file),
         };
-        Self::read(&xml_text::decode(&unpacked)?)
+        let mut root = Element::read(&xml_text::decode(&unpacked)?)?;
+        let mut missing = Vec::new();
+        for (reference, line) in references(&root) {
+            let document = match is_container {
+                true => container::named(file, &reference)?,
+                false => fetch(&reference),
+            };
+            let Some(document) = document else {
+                missing.push((reference, line));
+                continue;
+            };
+            let part = Element::read(&xml_text::decode(&document)?)?;
+            root.children.extend(part.children);
+        }
+        let mut module = Self::of(&root)?;
+        module
+            .findings
+            .extend(missing.into_iter().map(|(reference, line)| Finding {
+                about: reference,
+                what: "the manifest refers to this document, which is missing".to_owned(),
+                line,
+                is_note: false,
+            }));
+        Ok(module)
     }
 
     /// Reads a manifest, the text of the `.aml` file of an MTP.
@@ -30,35 +68,98 @@ impl Module {
     /// [`ManifestError`] if the file is not a manifest. Inconsistencies in a manifest are in
     /// [`findings`](Self::findings).
     pub fn read(manifest: &str) -> Result<Self, ManifestError> {
-        let root = Element::read(manifest)?;
+        Self::of(&Element::read(manifest)?)
+    }
+
+    fn of(root: &Element) -> Result<Self, ManifestError> {
         let of_module = |element: &&Element| element.path == "MTPSUCLib/ModuleTypePackage";
-        let module = root.all().find(of_module).ok_or(ManifestError::NoModule)?;
-        let mut reading = Reading::of(&root);
+        let mut modules = root.all().filter(of_module);
+        let module = modules.next().ok_or(ManifestError::NoModule)?;
+        let mut reading = Reading::of(root);
+        for other in modules {
+            let what = "the file describes several modules, and the first is read";
+            reading.find(other, &other.name, what);
+        }
         let services = root
             .all()
             .filter(|element| element.path == "MTPServiceSUCLib/Service")
             .map(|service| reading.service(service))
             .collect();
+        let assemblies = reading.data_assemblies(root);
+        let process_values = root
+            .all()
+            .filter(|element| element.kind() == "ProcessValueSet" || is_process_values(element))
+            .flat_map(|set| reading.outputs(&set.name, set))
+            .collect();
+        let alarms = reading.alarms(root);
+        reading.left_out(root);
+        let is_second = root.all().any(|element| {
+            element.path.starts_with("MTPServerAssemblySUCLib/")
+                || element.path.starts_with("MTPDataAssemblySUCLib/")
+        });
         Ok(Self {
             name: module.name.clone(),
             version: module.value(&["Version"]).unwrap_or_default().to_owned(),
+            edition: if is_second { Edition::V2 } else { Edition::V1 },
             endpoints: reading.endpoints,
+            servers: reading.servers,
+            items: reading.items,
+            assemblies,
+            process_values,
+            alarms,
             services,
             findings: reading.findings,
         })
     }
 }
 
+/// Returns the relative paths of other documents in the attributes `refURI`, with their lines.
+fn references(root: &Element) -> Vec<(String, usize)> {
+    let mut found: Vec<(String, usize)> = Vec::new();
+    for element in root.all() {
+        let Some(reference) = element.value(&["refURI"]) else {
+            continue;
+        };
+        let path = reference.split('#').next().unwrap_or_default();
+        let path = path.trim_start_matches("./").trim_start_matches('/');
+        let is_document = path
+            .rsplit_once('.')
+            .is_some_and(|(_, end)| end.eq_ignore_ascii_case("aml"));
+        let is_local = !path.contains("://") && !path.split('/').any(|part| part == "..");
+        let is_new = !found.iter().any(|(known, _)| known == path);
+        if is_document && is_local && is_new && found.len() < MAX_DOCUMENTS {
+            found.push((path.to_owned(), element.line));
+        }
+    }
+    found
+}
+
+/// Returns whether an element without a type is the set of process values, as in early files.
+fn is_process_values(element: &Element) -> bool {
+    element.path.is_empty()
+        && element.children.iter().any(|child| {
+            child
+                .path
+                .starts_with("MTPProcessValueSUCLib/ProcessValue/")
+        })
+}
+
 /// Index of the elements that are referenced in a file.
-struct Reading<'a> {
+pub(crate) struct Reading<'a> {
     /// OPCUAItems by their ID.
     nodes: HashMap<&'a str, Node>,
-    /// DataAssemblies by their RefID, and by their ID for files with services that reference the
-    /// ID.
+    /// ServiceControls and data assemblies of parameters by their RefID, and by their ID for files
+    /// with services that reference the ID.
     assemblies: HashMap<&'a str, &'a Element>,
+    /// All other data assemblies in the same way.
+    values: HashMap<&'a str, &'a Element>,
     /// All elements by their ID.
     elements: HashMap<&'a str, &'a Element>,
+    /// The values of attributes by their ID.
+    attributes: HashMap<&'a str, &'a str>,
     endpoints: Vec<String>,
+    servers: Vec<OpcUaServer>,
+    items: Vec<Item>,
     findings: Vec<Finding>,
 }
 
@@ -67,29 +168,53 @@ impl<'a> Reading<'a> {
         let mut reading = Self {
             nodes: HashMap::new(),
             assemblies: HashMap::new(),
+            values: HashMap::new(),
             elements: HashMap::new(),
+            attributes: HashMap::new(),
             endpoints: Vec::new(),
+            servers: Vec::new(),
+            items: Vec::new(),
             findings: Vec::new(),
         };
-        for element in root.all() {
+        let mut waiting = vec![(root, None, false)];
+        while let Some((element, mut server, is_in_list)) = waiting.pop() {
             if !element.id.is_empty() {
                 reading.elements.insert(&element.id, element);
             }
-            if element.kind() == "OPCUAServer" {
-                reading.server(element);
+            for attribute in &element.attributes {
+                if !attribute.id.is_empty() {
+                    reading
+                        .attributes
+                        .insert(&attribute.id, attribute.value.trim());
+                }
             }
-            let is_assembly =
-                matches!(element.kind(), "ServiceControl") || kind_of(element).is_some();
-            if is_assembly {
-                reading.assemblies.entry(&element.id).or_insert(element);
+            match element.kind() {
+                "OPCUAServer" => {
+                    reading.server(element);
+                    server = Some(element);
+                }
+                "OPCUAItem" => reading.item(element, server),
+                _ => {}
+            }
+            let is_first = matches!(element.kind(), "ServiceControl") || kind_of(element).is_some();
+            if is_first || elements::is_assembly(element, is_in_list) {
+                let index = match is_first {
+                    true => &mut reading.assemblies,
+                    false => &mut reading.values,
+                };
+                index.entry(&element.id).or_insert(element);
                 // There may be two: in the files that have two, the last attribute is referenced.
                 for attribute in element
                     .attributes
                     .iter()
                     .filter(|attribute| attribute.name == "RefID")
                 {
-                    reading.assemblies.insert(attribute.value.trim(), element);
+                    index.insert(attribute.value.trim(), element);
                 }
+            }
+            let is_list = elements::is_list(element);
+            for child in element.children.iter().rev() {
+                waiting.push((child, server, is_list));
             }
         }
         reading
@@ -97,34 +222,109 @@ impl<'a> Reading<'a> {
 
     fn server(&mut self, server: &'a Element) {
         let endpoint = server.value(&["Endpoint"]).unwrap_or_default();
+        if endpoint.is_empty() {
+            self.find(server, &server.name, "the OPCUAServer has no Endpoint");
+        }
         if !self.endpoints.iter().any(|known| known == endpoint) {
             self.endpoints.push(endpoint.to_owned());
         }
-        for item in server
-            .children
+        self.servers.push(OpcUaServer {
+            id: server.id.clone(),
+            name: server.name.clone(),
+            endpoint: endpoint.to_owned(),
+        });
+    }
+
+    fn item(&mut self, item: &'a Element, server: Option<&Element>) {
+        let Some(server) = server else {
+            self.find(
+                item,
+                &item.name,
+                "the OPCUAItem is not below an OPCUAServer",
+            );
+            return;
+        };
+        let (Some(identifier), Some(namespace)) =
+            (item.value(&["Identifier"]), item.value(&["Namespace"]))
+        else {
+            let what = "the OPCUAItem has no Identifier or no Namespace";
+            self.find(item, &item.name, what);
+            return;
+        };
+        let is_numeric = item
+            .attributes
             .iter()
-            .filter(|item| item.kind() == "OPCUAItem")
-        {
-            let (Some(identifier), Some(namespace)) =
-                (item.value(&["Identifier"]), item.value(&["Namespace"]))
-            else {
-                self.find(
-                    &item.name,
-                    "the OPCUAItem has no Identifier or no Namespace",
-                );
-                continue;
-            };
-            let is_numeric = item
-                .attributes
-                .iter()
-                .any(|attribute| attribute.name == "Identifier" && is_number(&attribute.data_type));
-            let node = Node {
-                endpoint: endpoint.to_owned(),
-                namespace: namespace.to_owned(),
-                identifier: Identifier::of(identifier, is_numeric),
-                access: Access::of(item.value(&["Access"])),
-            };
-            self.nodes.insert(&item.id, node);
+            .any(|attribute| attribute.name == "Identifier" && is_number(&attribute.data_type));
+        let node = Node {
+            item: item.id.clone(),
+            endpoint: server.value(&["Endpoint"]).unwrap_or_default().to_owned(),
+            namespace: namespace.to_owned(),
+            identifier: Identifier::of(identifier, is_numeric),
+            access: Access::of(item.value(&["Access"])),
+        };
+        self.items.push(Item {
+            name: item.name.clone(),
+            node: node.clone(),
+        });
+        let is_unnamed = item.id.is_empty();
+        if is_unnamed {
+            let what = "the OPCUAItem has no ID, so nothing refers to it";
+            self.find(item, &item.name, what);
+        } else if self.nodes.insert(&item.id, node).is_some() {
+            self.find(item, &item.name, "another OPCUAItem has the same ID");
+        }
+    }
+
+    /// Returns the node of an OPCUAItem by its ID.
+    pub(crate) fn node_of(&self, id: &str) -> Option<Node> {
+        self.nodes.get(id).cloned()
+    }
+
+    /// Returns the value of an attribute by its ID.
+    pub(crate) fn attribute_value(&self, id: &str) -> Option<&'a str> {
+        self.attributes.get(id).copied()
+    }
+
+    /// Returns the data assembly of any kind that an element references by its RefID.
+    pub(crate) fn value_assembly(&self, element: &Element) -> Option<&'a Element> {
+        let id = element.value(&["RefID"])?;
+        let found = self.values.get(id).or_else(|| self.assemblies.get(id));
+        found.copied()
+    }
+
+    /// Adds a note for each kind of elements that have no place in the model.
+    fn left_out(&mut self, root: &'a Element) {
+        let mut kinds: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
+        let mut waiting = vec![(root, false)];
+        while let Some((element, is_in_list)) = waiting.pop() {
+            let is_read = READ.contains(&element.kind())
+                || is_procedure(element)
+                || is_parameter(element)
+                || elements::is_assembly(element, is_in_list)
+                || (element.path.is_empty() && !element.is_interface);
+            if !is_read {
+                let known = kinds.entry(&element.path).or_insert((0, element.line));
+                known.0 += 1;
+                known.1 = known.1.min(element.line);
+            }
+            let is_list = elements::is_list(element);
+            waiting.extend(element.children.iter().map(|child| (child, is_list)));
+        }
+        for (path, (count, line)) in kinds {
+            let is_note = self.findings.len() < MAX_FINDINGS;
+            if is_note {
+                let about = if path.is_empty() {
+                    "an interface without a class"
+                } else {
+                    path
+                };
+                self.findings.push(Finding {
+                    about: about.to_owned(),
+                    what: format!("not read ({count} in the file)"),
+                    line,
+                    is_note,
+                });
+            }
         }
     }
 
@@ -133,6 +333,7 @@ impl<'a> Reading<'a> {
             Some(assembly) if assembly.kind() == "ServiceControl" => self.control(assembly),
             _ => {
                 self.find(
+                    element,
                     &element.name,
                     "no ServiceControl belongs to this service, so it cannot be commanded",
                 );
@@ -158,7 +359,11 @@ impl<'a> Reading<'a> {
             .filter(|child| is_procedure(child))
             .flat_map(required)
             .collect();
+        let outputs = self.outputs(&element.name, element);
+        let equipment = self.equipment(&element.name, element);
         Service {
+            outputs,
+            equipment,
             id: element.id.clone(),
             name: element.name.clone(),
             control,
@@ -175,7 +380,11 @@ impl<'a> Reading<'a> {
         let about = format!("{service}/{}", element.name);
         let number = element.value(&["ProcedureID", "ProcedureId", "StrategyID"]);
         let Some(number) = number.and_then(|number| number.parse().ok()) else {
-            self.find(&about, "it has no number by which it could be asked for");
+            self.find(
+                element,
+                &about,
+                "it has no number by which it could be asked for",
+            );
             return None;
         };
         let required = required(element).filter_map(|id| self.elements.get(id).copied());
@@ -185,7 +394,11 @@ impl<'a> Reading<'a> {
             .filter(|child| is_parameter(child))
             .chain(required)
             .collect();
+        let outputs = self.outputs(&about, element);
+        let equipment = self.equipment(&about, element);
         Some(Procedure {
+            outputs,
+            equipment,
             id: element.id.clone(),
             name: element.name.clone(),
             number,
@@ -204,6 +417,7 @@ impl<'a> Reading<'a> {
         else {
             let about = format!("{about}/{}", element.name);
             self.find(
+                element,
                 &about,
                 "no data assembly of a kind known here belongs to this parameter",
             );
@@ -212,12 +426,17 @@ impl<'a> Reading<'a> {
         Some(Parameter {
             id: element.id.clone(),
             name: element.name.clone(),
+            is_configuration: element.kind() == "ConfigurationParameter",
             kind,
             min: self.bound(assembly, "VMin"),
             max: self.bound(assembly, "VMax"),
             unit: self.bound(assembly, "VUnit"),
             write: self.node(assembly, &["VExt"]),
             read: self.node(assembly, &["VOut", "VFbk", "VRbk"]),
+            handshake: HANDSHAKE
+                .iter()
+                .filter_map(|name| Some(((*name).to_owned(), self.node(assembly, &[name])?)))
+                .collect(),
         })
     }
 
@@ -249,12 +468,16 @@ impl<'a> Reading<'a> {
         }
     }
 
-    fn find(&mut self, about: &str, what: &str) {
-        if self.findings.len() < MAX_FINDINGS {
-            self.findings.push(Finding {
-                about: about.to_owned(),
-                what: what.to_owned(),
-            });
+    /// Adds a finding about an element.
+    pub(crate) fn find(&mut self, element: &Element, about: &str, what: &str) {
+        let finding = Finding {
+            about: about.to_owned(),
+            what: what.to_owned(),
+            line: element.line,
+            is_note: false,
+        };
+        if self.findings.len() < MAX_FINDINGS && !self.findings.contains(&finding) {
+            self.findings.push(finding);
         }
     }
 }
@@ -296,7 +519,7 @@ fn kind_of(assembly: &Element) -> Option<ValueKind> {
     }
 }
 
-fn is_true(value: Option<&str>) -> bool {
+pub(crate) fn is_true(value: Option<&str>) -> bool {
     value.is_some_and(|value| value.eq_ignore_ascii_case("true") || value == "1")
 }
 
@@ -357,6 +580,63 @@ const ROLES: &[(Role, &[&str])] = &[
     (Role::ExternalByOperator, &["SrcExtOp"]),
     (Role::ExternalByAutomation, &["SrcExtAut"]),
     (Role::Quality, &["WQC"]),
+    (Role::SourceChannel, &["SrcChannel"]),
+    (Role::ModeChannel, &["StateChannel"]),
+    (Role::ApplyEnabled, &["ProcParamApplyEn"]),
+    (Role::ApplyByExternal, &["ProcParamApplyExt"]),
+    (Role::ConfigurationApplyEnabled, &["ConfigParamApplyEn"]),
+    (Role::ConfigurationApplyByExternal, &["ConfigParamApplyExt"]),
+    (Role::Question, &["InteractQuestionID"]),
+    (Role::Answer, &["InteractAnswerID"]),
+    (Role::Text, &["PosTextID"]),
+];
+
+/// The variables of a parameter beside its values, as far as a client from outside uses them.
+const HANDSHAKE: &[&str] = &[
+    "ApplyEn",
+    "ApplyExt",
+    "OpMode",
+    "SrcChannel",
+    "SrcExtAct",
+    "SrcExtAut",
+    "SrcExtOp",
+    "StateAutAct",
+    "StateAutAut",
+    "StateAutOp",
+    "StateChannel",
+    "StateOpAct",
+    "Sync",
+    "VReq",
+];
+
+/// Kinds of elements that the model has, or whose children it has.
+const READ: &[&str] = &[
+    "Alarm",
+    "AlarmGroup",
+    "AlarmMessage",
+    "AlarmSet",
+    "AlarmText",
+    "AspectSetReference",
+    "CommunicationSet",
+    "DataAssemblySet",
+    "ExternalDataConnector",
+    "InstanceList",
+    "ModuleTypePackage",
+    "OPCUAItem",
+    "OPCUAServer",
+    "ProcessValueIn",
+    "ProcessValueOut",
+    "ProcessValueSet",
+    "ReportValue",
+    "RequiredEquipment",
+    "ServerAssemblySet",
+    "Service",
+    "ServiceSet",
+    "ServicesSet",
+    "SourceList",
+    "TextSet",
 ];
 
 const MAX_FINDINGS: usize = 1000;
+/// Limit of documents that a manifest refers to.
+const MAX_DOCUMENTS: usize = 100;

@@ -181,6 +181,7 @@ fn a_service_is_a_capability_of_the_plant_where_that_is_told() {
 #[test]
 fn node_ids_are_written_so_that_they_can_be_read_back() {
     let node = mtp::Node {
+        item: "n".into(),
         endpoint: "opc.tcp://127.0.0.1".into(),
         namespace: "urn:a;b%".into(),
         identifier: mtp::Identifier::Text("x;y".into()),

@@ -31,7 +31,7 @@ pub mod yaml;
 pub use authority::{Authority, Owner};
 pub use client::{
     ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, Mirror, Mirrors,
-    PeerAccess, RemoteState, SkillClient, SkillHandle, ToolState, Watchable,
+    PeerAccess, RemoteState, SkillClient, SkillHandle, SkillStates, ToolState, Watchable,
 };
 pub use component::{
     Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, ExecSource, ExecWork,
@@ -55,3 +55,4 @@ pub use value::{Builtin, Shape, Value};
 pub use values::{
     DeviceValue, LiveValue, Measure, Measured, Reading, Sensor, Statistics, Tally, ValueFacts,
 };
+pub use variant::{from_variant, to_variant};

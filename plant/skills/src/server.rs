@@ -288,6 +288,9 @@ fn server_of(
     for file in &component.nodesets {
         builder = builder.nodeset_file(file);
     }
+    for (namespace, text) in component.device.iter().flat_map(|device| device.nodesets()) {
+        builder = builder.nodeset_str(&namespace, &text);
+    }
     Ok(builder.build()?)
 }
 

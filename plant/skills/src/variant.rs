@@ -5,7 +5,7 @@ use plant_opcua::types::{Array, NodeId, UAString, Variant, VariantScalarTypeId};
 use crate::value::{Builtin, Value};
 
 /// Converts a value to a Variant.
-pub(crate) fn to_variant(value: &Value) -> Variant {
+pub fn to_variant(value: &Value) -> Variant {
     match value {
         Value::Boolean(value) => Variant::Boolean(*value),
         Value::SByte(value) => Variant::SByte(*value),
@@ -80,7 +80,7 @@ pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(Strin
     clippy::wildcard_enum_match_arm,
     reason = "of the types of OPC UA those that a skill can be told in are named"
 )]
-pub(crate) fn from_variant(variant: &Variant) -> Option<Value> {
+pub fn from_variant(variant: &Variant) -> Option<Value> {
     Some(match variant {
         Variant::Boolean(value) => Value::Boolean(*value),
         Variant::SByte(value) => Value::SByte(*value),

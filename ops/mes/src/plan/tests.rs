@@ -259,7 +259,7 @@ fn a_service_of_a_module_is_told_and_not_chosen() {
     let plan = plan(&process(), &offers, &[]);
     assert_eq!(
         why(&plan, Role::Grasp, "dosing#Dose"),
-        "it is a service of a module, and those are not run from here"
+        "it is a service in a manifest; `ua-component` with `device: {mtp: ..}` runs it as a skill"
     );
     assert!(!plan.is_complete());
 }

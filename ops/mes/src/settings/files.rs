@@ -31,6 +31,18 @@ pub(crate) struct Manifest {
     pub(crate) iri: String,
     /// Classes of capabilities by the name of a service, or of `service/procedure`.
     pub(crate) capabilities: BTreeMap<String, Vec<String>>,
+    /// The connection to the module, for the states of its services.
+    pub(crate) connect: Connect,
+}
+
+/// The connection to a module.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Connect {
+    No,
+    /// At the endpoint of the manifest.
+    Yes,
+    /// At this endpoint.
+    At(String),
 }
 
 impl Reading<'_> {
@@ -82,9 +94,16 @@ impl Reading<'_> {
     }
 
     pub(super) fn manifest(&mut self, node: &Node) -> Option<Manifest> {
-        let [name, file, iri, capabilities] = self
-            .reader
-            .map(node, ["name", "file", "iri", "capabilities"])?;
+        let keys = ["name", "file", "iri", "capabilities", "connect"];
+        let [name, file, iri, capabilities, connect] = self.reader.map(node, keys)?;
+        let connect = match connect {
+            None => Connect::No,
+            Some(node) => match self.reader.text(node, "true, false or an endpoint")? {
+                "false" => Connect::No,
+                "true" => Connect::Yes,
+                _ => Connect::At(self.endpoint(node)?),
+            },
+        };
         let file = self
             .reader
             .needed(file, "file", node.place)
@@ -121,6 +140,7 @@ impl Reading<'_> {
             source: self.source(&name?, file?),
             iri: iri?,
             capabilities: told,
+            connect,
         })
     }
 }

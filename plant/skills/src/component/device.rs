@@ -1,13 +1,14 @@
 //! Devices that do the work of skills, implemented by other crates.
 
 use std::fmt::Debug;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use tokio::sync::watch;
 
-use super::{DriverFault, SensorRead};
+use super::{DriverFault, SensorRead, SkillSetup};
 use crate::client::{PeerAccess, ToolState};
 use crate::driver::Driver;
 use crate::parameters::TypeName;
@@ -27,6 +28,16 @@ pub trait Device: Debug + Send + Sync {
         types: &[TypeName],
         peers: &PeerAccess,
     ) -> Result<Arc<dyn Driver>, DriverFault>;
+
+    /// Returns the NodeSets with the types of its skills, each with the URI of its namespace.
+    fn nodesets(&self) -> Vec<(String, String)> {
+        Vec::new()
+    }
+
+    /// Returns the skills of a component whose description names none.
+    fn skills(&self) -> Vec<SkillSetup> {
+        Vec::new()
+    }
 
     /// Returns whether its drivers discover other components.
     fn looks_for_others(&self) -> bool {
@@ -59,8 +70,8 @@ pub trait Device: Debug + Send + Sync {
 /// The kinds of devices that the YAML of a component can contain.
 pub trait DeviceKinds {
     /// Reads the value of the key `device`. Returns `None` after an error, which is added to the
-    /// findings.
-    fn read(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>;
+    /// findings. Paths in the value are relative to `folder`.
+    fn read(&self, node: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>>;
 
     /// Reads the driver `http` of a skill. Returns `None` after an error, which is added to the
     /// findings.
@@ -98,7 +109,12 @@ impl Sensor for DeviceSensor {
 pub struct NoDevices;
 
 impl DeviceKinds for NoDevices {
-    fn read(&self, node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Device>> {
+    fn read(
+        &self,
+        node: &Node,
+        _folder: &Path,
+        reader: &mut Reader<'_>,
+    ) -> Option<Arc<dyn Device>> {
         let message = "this program knows no devices".to_owned();
         reader.refuse(node, Code::Driver, message)
     }

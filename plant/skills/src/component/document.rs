@@ -146,7 +146,7 @@ fn component(
         None => Some(Some(anonymous_by_default())),
     };
     let limits = read_limits(limits, reader);
-    let device = device.map(|node| kinds.read(node, reader));
+    let device = device.map(|node| kinds.read(node, folder, reader));
     let robot = robot.map(|node| read_robot(node, reader));
     let power_off = power_off.map_or(Some(false), |node| reader.boolean(node));
     let world = world.map_or_else(BTreeMap::new, |node| read_world(node, reader));
@@ -154,6 +154,7 @@ fn component(
         folder,
         kinds,
         device: device.as_ref().and_then(Option::as_ref),
+        is_refused: matches!(device, Some(None)),
     };
     let parts = read_parts(root, [skills, values, configurable], &around, reader);
     Some(Component {
@@ -193,8 +194,13 @@ fn read_parts(
     around: &Around<'_>,
     reader: &mut Reader<'_>,
 ) -> Parts {
-    // A sensor has values and no skills.
+    let of_device = match (around.device, skills) {
+        (Some(device), None) => device.skills(),
+        _ => Vec::new(),
+    };
     let skills = match (skills, values) {
+        (None, _) if !of_device.is_empty() || around.is_refused => Some(of_device),
+        // A sensor has values and no skills.
         (None, Some(_)) => Some(Vec::new()),
         (skills, _) => reader
             .needed(skills, "skills", root.place)

@@ -74,6 +74,8 @@ pub(super) struct Around<'a> {
     pub(super) folder: &'a Path,
     pub(super) kinds: &'a dyn DeviceKinds,
     pub(super) device: Option<&'a Arc<dyn Device>>,
+    /// Whether the device was refused. It may have had skills.
+    pub(super) is_refused: bool,
 }
 
 /// The surroundings, and the skills of the component.

@@ -1,0 +1,399 @@
+//! The handshake with a service: mode and source, procedure, parameters and commands. Each wait has
+//! a name and a time limit.
+
+use std::time::Duration;
+
+use async_trait::async_trait;
+use mtp::pea::{OP_MODE_AUTOMATIC, OP_MODE_AUTOMATIC_ACTIVE, OP_MODE_EXTERNAL};
+use mtp::state::{Command, State};
+use mtp::{Bound, Node, Parameter, Procedure, Role, Service};
+use skills::{ClientOptions, Value};
+use tokio::time::{Instant, sleep};
+
+use super::is_equal;
+
+/// Access to the nodes of a module.
+#[async_trait]
+pub trait ModuleNodes: Send + Sync + 'static {
+    /// Sets the identity of later connections.
+    fn identify(&self, options: &ClientOptions) {
+        let _unused = options;
+    }
+
+    /// Waits until the server of a node can be reached.
+    ///
+    /// # Errors
+    /// The reason why it cannot, as text for people.
+    async fn connect(&self, node: &Node, within: Duration) -> Result<(), String>;
+
+    /// Reads the values of nodes of one server; `None` for bad values.
+    ///
+    /// # Errors
+    /// There is no response.
+    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, String>;
+
+    /// Writes a value in the type of the node.
+    ///
+    /// # Errors
+    /// The value was refused, or there is no response.
+    async fn write(&self, node: &Node, value: Value) -> Result<(), String>;
+}
+
+/// Time limits of a module.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Timing {
+    /// Time limit of the connection.
+    pub connect: Duration,
+    /// Time limit of each wait of the handshake.
+    pub handshake: Duration,
+    /// Time limit from Halt until the service has stopped.
+    pub stop: Duration,
+    /// Time without answers after which the end of a run is unknown.
+    pub lost: Duration,
+    /// Interval of reads.
+    pub poll: Duration,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            connect: Duration::from_secs(5),
+            handshake: Duration::from_secs(5),
+            stop: Duration::from_secs(10),
+            lost: Duration::from_secs(10),
+            poll: Duration::from_millis(50),
+        }
+    }
+}
+
+/// A service and the access to its nodes.
+pub(super) struct Handshake<'a> {
+    pub(super) service: &'a Service,
+    pub(super) nodes: &'a dyn ModuleNodes,
+    pub(super) timing: Timing,
+}
+
+/// The word StateCur.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum StateWord {
+    Known(State),
+    /// A word that is no state of the standard.
+    Unknown(u32),
+}
+
+impl std::fmt::Display for StateWord {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Known(state) => state.fmt(f),
+            Self::Unknown(word) => write!(f, "the unknown state {word}"),
+        }
+    }
+}
+
+impl Handshake<'_> {
+    /// Reads the state of the service.
+    pub(super) async fn state(&self) -> Result<StateWord, String> {
+        let node = self.needed(Role::State, "StateCur")?;
+        let word = self.word(node, "StateCur").await?;
+        Ok(match State::of_bit(word) {
+            Some(state) => StateWord::Known(state),
+            None => StateWord::Unknown(word),
+        })
+    }
+
+    /// Requests automatic mode and the external source, and waits for both.
+    pub(super) async fn mode(&self) -> Result<(), String> {
+        if let Some(node) = self.node(Role::OperationMode) {
+            return self.mode_word(node).await;
+        }
+        self.request(
+            self.node(Role::AutomaticActive),
+            [
+                self.node(Role::AutomaticByOperator),
+                self.node(Role::AutomaticByAutomation),
+            ],
+            "automatic mode (StateAutAct)",
+        )
+        .await?;
+        self.request(
+            self.node(Role::ExternalActive),
+            [
+                self.node(Role::ExternalByOperator),
+                self.node(Role::ExternalByAutomation),
+            ],
+            "the external source (SrcExtAct)",
+        )
+        .await
+    }
+
+    /// Requests the mode by the word of early drafts, which confirms automatic mode only.
+    async fn mode_word(&self, node: &Node) -> Result<(), String> {
+        let word = self.word(node, "OpMode").await?;
+        if word & OP_MODE_AUTOMATIC_ACTIVE == 0 {
+            self.write(node, Value::UInt32(OP_MODE_AUTOMATIC), "OpMode")
+                .await?;
+            let is_active = |value: &Value| as_word(value) & OP_MODE_AUTOMATIC_ACTIVE != 0;
+            self.wait(node, is_active, "automatic mode (OpMode)")
+                .await?;
+        }
+        self.write(node, Value::UInt32(OP_MODE_EXTERNAL), "OpMode")
+            .await
+    }
+
+    /// Requests a mode or source that is not active, and waits for it. A service without the nodes
+    /// has no such modes.
+    async fn request(
+        &self,
+        active: Option<&Node>,
+        requests: [Option<&Node>; 2],
+        what: &str,
+    ) -> Result<(), String> {
+        let Some(active) = active else { return Ok(()) };
+        if self.is_true(active).await? {
+            return Ok(());
+        }
+        // A request that cannot be written from outside belongs to the automation of the module.
+        let mut requests = requests.into_iter().flatten();
+        let Some(request) = requests.find(|node| node.access.writes) else {
+            return Err(format!(
+                "{what} is not active, and the manifest has no node to request it"
+            ));
+        };
+        self.write(request, Value::Boolean(true), what).await?;
+        let is_active = |value: &Value| *value == Value::Boolean(true);
+        self.wait(active, is_active, what).await
+    }
+
+    /// Selects a procedure, and waits until the service has accepted the selection.
+    pub(super) async fn select(&self, procedure: &Procedure) -> Result<(), String> {
+        let Some(node) = self.node(Role::ProcedureWanted) else {
+            let is_only = self.service.procedures.len() == 1;
+            return match is_only {
+                true => Ok(()),
+                false => Err("the manifest has no node to select the procedure".to_owned()),
+            };
+        };
+        let number = procedure.number;
+        self.write(node, Value::UInt32(number), "ProcedureExt")
+            .await?;
+        let accepted = self.node(Role::ProcedureRequested).unwrap_or(node);
+        let is_accepted = |value: &Value| as_word(value) == number;
+        let what = format!("procedure {number} (ProcedureReq)");
+        self.wait(accepted, is_accepted, &what).await
+    }
+
+    /// Writes a parameter within its limits, and waits until the module has taken the value.
+    pub(super) async fn parameter(
+        &self,
+        parameter: &Parameter,
+        value: &Value,
+    ) -> Result<(), String> {
+        let name = &parameter.name;
+        let Some(node) = &parameter.write else {
+            return Err(format!("{name} has no node for writing"));
+        };
+        self.limits(parameter, value).await?;
+        let shake = |wanted: &str| {
+            let mut nodes = parameter.handshake.iter();
+            nodes
+                .find(|(known, _)| known == wanted)
+                .map(|(_, node)| node)
+        };
+        let follows_service = match shake("Sync") {
+            Some(sync) => self.is_true(sync).await?,
+            None => false,
+        };
+        if !follows_service {
+            self.request(
+                shake("StateAutAct"),
+                [shake("StateAutOp"), shake("StateAutAut")],
+                &format!("automatic mode of {name}"),
+            )
+            .await?;
+            self.request(
+                shake("SrcExtAct"),
+                [shake("SrcExtOp"), shake("SrcExtAut")],
+                &format!("the external source of {name}"),
+            )
+            .await?;
+        }
+        self.write(node, value.clone(), &format!("{name}.VExt"))
+            .await?;
+        let is_written = |read: &Value| is_equal(value, read);
+        self.wait(node, is_written, &format!("the value of {name} (VExt)"))
+            .await?;
+        let Some(apply) = shake("ApplyExt") else {
+            return Ok(());
+        };
+        if let Some(enabled) = shake("ApplyEn") {
+            let is_enabled = |read: &Value| *read == Value::Boolean(true);
+            self.wait(enabled, is_enabled, &format!("ApplyEn of {name}"))
+                .await?;
+        }
+        self.write(apply, Value::Boolean(true), &format!("{name}.ApplyExt"))
+            .await?;
+        match shake("VReq") {
+            Some(requested) => {
+                let what = format!("the applied value of {name} (VReq)");
+                self.wait(requested, is_written, &what).await
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Checks the limits that the file or the module has.
+    async fn limits(&self, parameter: &Parameter, value: &Value) -> Result<(), String> {
+        let Some(number) = value.as_f64() else {
+            return Ok(());
+        };
+        let mut limits = [None, None];
+        for (limit, bound) in limits.iter_mut().zip([&parameter.min, &parameter.max]) {
+            *limit = match bound {
+                Some(Bound::Constant(limit)) => Some(*limit),
+                Some(Bound::Node(node)) => {
+                    let read = self.nodes.read(&[node]).await?;
+                    read.into_iter()
+                        .next()
+                        .flatten()
+                        .and_then(|one| one.as_f64())
+                }
+                None => None,
+            };
+        }
+        let [low, high] = limits;
+        // Modules without limits have zero in both nodes.
+        if low.is_some() && low == high {
+            return Ok(());
+        }
+        if low.is_some_and(|low| number < low) || high.is_some_and(|high| number > high) {
+            let shown = |limit: Option<f64>| limit.map_or("any".to_owned(), |one| one.to_string());
+            return Err(format!(
+                "{} is from {} to {} in the module, and {number} was given",
+                parameter.name,
+                shown(low),
+                shown(high)
+            ));
+        }
+        Ok(())
+    }
+
+    /// Returns whether the service allows a command; true if it does not say so.
+    pub(super) async fn allows(&self, command: Command) -> Result<bool, String> {
+        match self.node(Role::CommandEnabled) {
+            Some(node) => Ok(self.word(node, "CommandEn").await? & command.bit() != 0),
+            None => Ok(true),
+        }
+    }
+
+    /// Waits until the service allows a command.
+    pub(super) async fn allowed(&self, command: Command) -> Result<(), String> {
+        let Some(node) = self.node(Role::CommandEnabled) else {
+            return Ok(());
+        };
+        let is_allowed = |value: &Value| as_word(value) & command.bit() != 0;
+        self.wait(node, is_allowed, &format!("{command} in CommandEn"))
+            .await
+    }
+
+    /// Writes a command. A command that the service left in place is removed before.
+    pub(super) async fn command(&self, command: Command) -> Result<(), String> {
+        let node = self.needed(Role::Command, "CommandExt")?;
+        if self.word(node, "CommandExt").await? != 0 {
+            self.write(node, Value::UInt32(0), "CommandExt").await?;
+        }
+        self.write(node, Value::UInt32(command.bit()), "CommandExt")
+            .await
+    }
+
+    /// Removes a command that the service did not remove, so that it has no effect later.
+    pub(super) async fn withdraw(&self) -> Result<(), String> {
+        let node = self.needed(Role::Command, "CommandExt")?;
+        if self.word(node, "CommandExt").await? != 0 {
+            self.write(node, Value::UInt32(0), "CommandExt").await?;
+        }
+        Ok(())
+    }
+
+    /// Waits until the state fulfils a condition. Returns the state.
+    pub(super) async fn until(
+        &self,
+        is: impl Fn(StateWord) -> bool,
+        (what, within): (&str, Duration),
+    ) -> Result<StateWord, String> {
+        let end = Instant::now() + within;
+        loop {
+            let state = self.state().await;
+            match state {
+                Ok(state) if is(state) => return Ok(state),
+                _ if Instant::now() < end => sleep(self.timing.poll).await,
+                Ok(state) => {
+                    return Err(format!("{what}: the service is {state} after {within:?}"));
+                }
+                Err(why) => return Err(format!("{what}: {why}")),
+            }
+        }
+    }
+
+    async fn wait(
+        &self,
+        node: &Node,
+        is: impl Fn(&Value) -> bool,
+        what: &str,
+    ) -> Result<(), String> {
+        let within = self.timing.handshake;
+        let end = Instant::now() + within;
+        loop {
+            let read = self.nodes.read(&[node]).await?;
+            let value = read.into_iter().next().flatten();
+            if value.as_ref().is_some_and(&is) {
+                return Ok(());
+            }
+            if Instant::now() >= end {
+                let found = value.map_or("no value".to_owned(), |value| value.to_string());
+                return Err(format!(
+                    "{what} was not confirmed within {within:?}: {} has {found}",
+                    node.id()
+                ));
+            }
+            sleep(self.timing.poll).await;
+        }
+    }
+
+    async fn write(&self, node: &Node, value: Value, what: &str) -> Result<(), String> {
+        let written = self.nodes.write(node, value).await;
+        written.map_err(|why| format!("cannot write {what} ({}): {why}", node.id()))
+    }
+
+    async fn word(&self, node: &Node, what: &str) -> Result<u32, String> {
+        let read = self.nodes.read(&[node]).await?;
+        let value = read.into_iter().next().flatten();
+        let value = value.ok_or_else(|| format!("{what} ({}) has no value", node.id()))?;
+        Ok(as_word(&value))
+    }
+
+    async fn is_true(&self, node: &Node) -> Result<bool, String> {
+        let read = self.nodes.read(&[node]).await?;
+        Ok(read.into_iter().next().flatten() == Some(Value::Boolean(true)))
+    }
+
+    fn node(&self, role: Role) -> Option<&Node> {
+        self.service.control.node(role)
+    }
+
+    fn needed(&self, role: Role, name: &str) -> Result<&Node, String> {
+        let node = self.node(role);
+        node.ok_or_else(|| format!("the manifest has no {name} for {}", self.service.name))
+    }
+}
+
+/// Returns the word in an integer of any type; 0 for other values.
+fn as_word(value: &Value) -> u32 {
+    match value {
+        Value::Boolean(_) | Value::String(_) | Value::Array(..) => 0,
+        number => number
+            .to_json()
+            .as_i64()
+            .and_then(|number| u32::try_from(number).ok())
+            .unwrap_or_default(),
+    }
+}

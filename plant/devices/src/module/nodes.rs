@@ -1,0 +1,135 @@
+//! The nodes of a module over OPC UA.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use mtp::{Identifier, Node};
+use plant_opcua::client::{Client, ClientConfig};
+use plant_opcua::types::{NodeId, Variant};
+use skills::{ClientOptions, Shape, Value, from_variant, to_variant};
+
+use super::handshake::ModuleNodes;
+
+/// Clients of the servers of a module. Each is opened at the first connection, and reconnects by
+/// itself.
+pub(super) struct UaNodes {
+    /// The endpoint in place of the endpoints of the manifest.
+    endpoint: Option<String>,
+    options: Mutex<ClientOptions>,
+    clients: Mutex<HashMap<String, Client>>,
+}
+
+impl UaNodes {
+    pub(super) fn new(endpoint: Option<String>) -> Self {
+        Self {
+            endpoint,
+            options: Mutex::default(),
+            clients: Mutex::default(),
+        }
+    }
+
+    fn client(&self, node: &Node) -> Client {
+        let endpoint = self.endpoint.as_ref().unwrap_or(&node.endpoint);
+        let mut clients = self.clients.lock().unwrap_or_else(PoisonError::into_inner);
+        let open = || {
+            let options = self.options.lock().unwrap_or_else(PoisonError::into_inner);
+            let config = ClientConfig {
+                pki: options.pki.clone(),
+                user: options.user.clone(),
+                security: options.security,
+                timeout: options.within,
+                ..ClientConfig::new(&options.application_uri, &options.application_name)
+            };
+            Client::open(config, endpoint)
+        };
+        clients.entry(endpoint.clone()).or_insert_with(open).clone()
+    }
+}
+
+#[async_trait]
+impl ModuleNodes for UaNodes {
+    fn identify(&self, options: &ClientOptions) {
+        let mut known = self.options.lock().unwrap_or_else(PoisonError::into_inner);
+        known.clone_from(options);
+    }
+
+    async fn connect(&self, node: &Node, within: Duration) -> Result<(), String> {
+        let endpoint = self.endpoint.as_ref().unwrap_or(&node.endpoint);
+        let connected = self.client(node).up(within).await;
+        connected.map_err(|error| format!("cannot connect to the module at {endpoint}: {error}"))
+    }
+
+    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, String> {
+        let Some(first) = nodes.first() else {
+            return Ok(Vec::new());
+        };
+        let client = self.client(first);
+        let ids: Vec<NodeId> = nodes
+            .iter()
+            .map(|node| node_id(&client, node))
+            .collect::<Result<_, _>>()?;
+        let values = client.read(&ids).await.map_err(|error| error.to_string())?;
+        let good = values.into_iter().map(|value| {
+            let is_good = value.status.is_none_or(|status| status.is_good());
+            value.value.filter(|_| is_good)
+        });
+        Ok(good.map(|value| from_variant(&value?)).collect())
+    }
+
+    async fn write(&self, node: &Node, value: Value) -> Result<(), String> {
+        let client = self.client(node);
+        let id = node_id(&client, node)?;
+        let [known] = self.read(&[node]).await?.try_into().unwrap_or([None]);
+        let variant = match known {
+            Some(known) => in_type_of(&known, &value)?,
+            // A node without a value has no type here; the server checks the type.
+            None => to_variant(&value),
+        };
+        let written = client.write(&[(id, variant)]).await;
+        let statuses = written.map_err(|error| error.to_string())?;
+        match statuses.first() {
+            Some(status) if status.is_good() => Ok(()),
+            Some(status) => Err(status.to_string()),
+            None => Err("the server gave no result".to_owned()),
+        }
+    }
+}
+
+/// Returns the NodeId of a node in the namespaces of a server.
+fn node_id(client: &Client, node: &Node) -> Result<NodeId, String> {
+    let index = match node.namespace.parse() {
+        // Some manifests have an index in place of a URI.
+        Ok(index) => Some(index),
+        Err(_) => client.namespace(&node.namespace),
+    };
+    let index: u16 = index.ok_or_else(|| {
+        format!(
+            "the server of the module has no namespace {}",
+            node.namespace
+        )
+    })?;
+    Ok(match &node.identifier {
+        Identifier::Numeric(number) => NodeId::new(index, *number),
+        Identifier::Text(text) => NodeId::new(index, text.as_str()),
+    })
+}
+
+/// Converts a value to the type of the present value of a node.
+fn in_type_of(known: &Value, value: &Value) -> Result<Variant, String> {
+    let shape: Shape = known.shape();
+    let is_same = value.shape() == shape;
+    let converted = match (known, value.as_f64()) {
+        _ if is_same => Some(value.clone()),
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "the module has fewer digits"
+        )]
+        (Value::Float(_), Some(number)) => Some(Value::Float(number as f32)),
+        (Value::Boolean(_) | Value::String(_), _) => None,
+        _ => shape.read_json(&value.to_json()).ok(),
+    };
+    let converted = converted.ok_or_else(|| format!("{value} is no {shape}"))?;
+    Ok(to_variant(&converted))
+}

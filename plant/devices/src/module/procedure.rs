@@ -1,0 +1,315 @@
+//! A run of a procedure.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use mtp::state::{Command, State};
+use mtp::{Output, OutputRole, Parameter, Procedure, Role, Service};
+use skills::{Driver, Results, Value, Work};
+use tokio::sync::Mutex;
+use tokio::time::{Instant, sleep};
+
+use super::handshake::{Handshake, ModuleNodes, StateWord, Timing};
+use super::is_equal;
+
+/// The driver of a procedure.
+pub(super) struct Run {
+    pub(super) service: Arc<Service>,
+    pub(super) procedure: Arc<Procedure>,
+    pub(super) parameters: Vec<Parameter>,
+    pub(super) nodes: Arc<dyn ModuleNodes>,
+    pub(super) busy: Arc<Mutex<()>>,
+    pub(super) timing: Timing,
+}
+
+/// Returns the outputs that a run of a procedure reads.
+pub(super) fn outputs<'s>(
+    service: &'s Service,
+    procedure: &'s Procedure,
+) -> impl Iterator<Item = &'s Output> {
+    let all = procedure.outputs.iter().chain(&service.outputs);
+    all.filter(|output| output.role != OutputRole::ProcessValueIn && output.node.is_some())
+}
+
+#[async_trait]
+impl Driver for Run {
+    fn can_suspend(&self) -> bool {
+        true
+    }
+
+    fn halt_timeout(&self) -> Option<Duration> {
+        Some(self.timing.stop + self.timing.handshake)
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let Ok(_alone) = self.busy.try_lock() else {
+            return Err(format!(
+                "the service {} runs another procedure",
+                self.service.name
+            ));
+        };
+        let shake = Handshake {
+            service: &self.service,
+            nodes: &*self.nodes,
+            timing: self.timing,
+        };
+        tokio::select! {
+            prepared = self.prepare(&shake, &work) => prepared?,
+            () = work.stopped() => return Err("stopped before Start".to_owned()),
+        }
+        self.start(&shake, &work).await?;
+        self.follow(&shake, &work).await
+    }
+}
+
+impl Run {
+    /// Prepares the service: nothing moves.
+    async fn prepare(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), String> {
+        work.step("connect").await;
+        let state_node = self.service.control.node(Role::State);
+        let state_node = state_node.ok_or("the manifest has no StateCur")?;
+        self.nodes.connect(state_node, self.timing.connect).await?;
+        work.step("mode and source").await;
+        shake.mode().await?;
+        let state = shake.state().await?;
+        let is_at_end = matches!(
+            state,
+            StateWord::Known(State::Completed | State::Stopped | State::Aborted)
+        );
+        if is_at_end {
+            work.step("reset").await;
+            shake.allowed(Command::Reset).await?;
+            shake.command(Command::Reset).await?;
+            let within = (
+                "the service was reset and is to be Idle",
+                self.timing.handshake,
+            );
+            shake
+                .until(|state| state == StateWord::Known(State::Idle), within)
+                .await?;
+            shake.withdraw().await?;
+        } else if state != StateWord::Known(State::Idle) {
+            return Err(format!(
+                "the service {} is {state}, so it cannot be started",
+                self.service.name
+            ));
+        }
+        work.step("procedure").await;
+        shake.select(&self.procedure).await?;
+        if !self.parameters.is_empty() {
+            work.step("parameters").await;
+        }
+        for parameter in &self.parameters {
+            let value = work.parameters().get(&parameter.name);
+            let value = value.ok_or_else(|| format!("{} is missing", parameter.name))?;
+            shake.parameter(parameter, value).await?;
+        }
+        work.step("start").await;
+        shake.allowed(Command::Start).await
+    }
+
+    /// Starts the procedure. A Start that has no effect is withdrawn.
+    async fn start(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), String> {
+        if work.is_stopped() {
+            return Err("stopped before Start".to_owned());
+        }
+        let sent = shake.command(Command::Start).await;
+        let is_idle = |state| state == StateWord::Known(State::Idle);
+        let within = ("Start was written", self.timing.handshake);
+        let Err(why) = shake.until(|state| !is_idle(state), within).await else {
+            return shake.withdraw().await.or(Ok(()));
+        };
+        let why = match sent {
+            Ok(()) => why,
+            Err(refused) => refused,
+        };
+        let state = match shake.withdraw().await {
+            Ok(()) => shake.state().await,
+            Err(why) => Err(why),
+        };
+        match state {
+            Ok(state) if is_idle(state) => Err(format!("{why}; Start was withdrawn")),
+            Ok(_) => Ok(()),
+            Err(silent) => {
+                let what = format!("{why}; whether the procedure runs is unknown: {silent}");
+                work.unknown(what.clone()).await;
+                Err(what)
+            }
+        }
+    }
+
+    /// Follows the procedure to its end.
+    async fn follow(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, String> {
+        let run_time = work.parameters().number(RUN_TIME).unwrap_or_default();
+        let run_time = Duration::try_from_secs_f64(run_time).unwrap_or_default();
+        let mut shown = None;
+        let mut executed = Duration::ZERO;
+        let mut has_executed = false;
+        let mut is_completing = false;
+        let mut answered = Instant::now();
+        loop {
+            let before = Instant::now();
+            let state = shake.state().await;
+            if let Ok(state) = state {
+                answered = Instant::now();
+                if shown != Some(state) {
+                    shown = Some(state);
+                    work.step(state.to_string()).await;
+                }
+            }
+            match state {
+                Ok(StateWord::Known(State::Completed)) => return self.results(shake, work).await,
+                Ok(StateWord::Known(end @ (State::Stopped | State::Aborted))) => {
+                    return Err(format!("the service is {end}, and not Completed"));
+                }
+                Ok(StateWord::Known(State::Idle)) => {
+                    return Err("the service is Idle again, and was not Completed".to_owned());
+                }
+                Ok(StateWord::Known(State::Execute)) => {
+                    if !has_executed {
+                        has_executed = true;
+                        self.compare(work).await;
+                    }
+                    let is_over = !run_time.is_zero() && executed >= run_time;
+                    if is_over && !is_completing {
+                        shake.allowed(Command::Complete).await?;
+                        shake.command(Command::Complete).await?;
+                        is_completing = true;
+                    }
+                }
+                Ok(_) => {}
+                Err(why) if answered.elapsed() > self.timing.lost => {
+                    let lost = self.timing.lost;
+                    let what = format!("no answer for {lost:?}, so the end is unknown: {why}");
+                    work.unknown(what.clone()).await;
+                    return Err(what);
+                }
+                Err(_) => {}
+            }
+            tokio::select! {
+                biased;
+                () = work.held() => {
+                    if work.is_stopped() || self.suspend(shake, work).await?.is_some() {
+                        return Err(self.stop(shake, work).await);
+                    }
+                }
+                () = sleep(self.timing.poll) => {}
+            }
+            if state == Ok(StateWord::Known(State::Execute)) {
+                executed += before.elapsed();
+                if !run_time.is_zero() {
+                    let share = executed.as_secs_f64() / run_time.as_secs_f64();
+                    // A share of 1 has enough digits.
+                    #[expect(clippy::cast_possible_truncation, reason = "a share from 0 to 1")]
+                    work.progress(share.min(1.0) as f32);
+                }
+            }
+        }
+    }
+
+    /// Pauses or holds the service, and continues it. Returns `Some` if the run was stopped
+    /// meanwhile.
+    async fn suspend(&self, shake: &Handshake<'_>, work: &Work) -> Result<Option<()>, String> {
+        let can_pause = shake.allows(Command::Pause).await?;
+        let (command, rest, resume) = match can_pause {
+            true => (Command::Pause, State::Paused, Command::Resume),
+            false => (Command::Hold, State::Held, Command::Unhold),
+        };
+        shake.allowed(command).await?;
+        shake.command(command).await?;
+        let within = (command.name(), self.timing.handshake);
+        let is_at_rest = |state| matches!(state, StateWord::Known(known) if known == rest || known == State::Completed);
+        let reached = shake.until(is_at_rest, within).await?;
+        shake.withdraw().await?;
+        if reached == StateWord::Known(State::Completed) {
+            return Ok(None);
+        }
+        work.step(rest.name()).await;
+        if work.going().await.is_err() {
+            return Ok(Some(()));
+        }
+        shake.allowed(resume).await?;
+        shake.command(resume).await?;
+        let within = (resume.name(), self.timing.handshake);
+        shake
+            .until(|state| state != StateWord::Known(rest), within)
+            .await?;
+        shake.withdraw().await?;
+        Ok(None)
+    }
+
+    /// Stops the service: Stop, or Abort if Stop is not allowed. Returns the reason for the end.
+    async fn stop(&self, shake: &Handshake<'_>, work: &Work) -> String {
+        let command = match shake.allows(Command::Stop).await {
+            Ok(true) | Err(_) => Command::Stop,
+            Ok(false) => Command::Abort,
+        };
+        let is_at_end = |state| {
+            matches!(
+                state,
+                StateWord::Known(State::Stopped | State::Aborted | State::Completed | State::Idle)
+            )
+        };
+        let sent = shake.command(command).await;
+        let within = ("the service is to be Stopped", self.timing.stop);
+        match shake.until(is_at_end, within).await {
+            Ok(state) => {
+                // The end is known; a command that stays in place is removed by the next run.
+                let _removed = shake.withdraw().await;
+                format!("stopped: the service is {state}")
+            }
+            Err(why) => {
+                let why = sent.err().unwrap_or(why);
+                let what = format!("{command} is not confirmed, so the end is unknown: {why}");
+                work.unknown(what.clone()).await;
+                what
+            }
+        }
+    }
+
+    /// Notes parameters whose effective value differs from the written value.
+    async fn compare(&self, work: &Work) {
+        for parameter in &self.parameters {
+            let (Some(node), Some(written)) =
+                (&parameter.read, work.parameters().get(&parameter.name))
+            else {
+                continue;
+            };
+            let Ok(read) = self.nodes.read(&[node]).await else {
+                return;
+            };
+            if let Some(read) = read.into_iter().next().flatten()
+                && !is_equal(written, &read)
+            {
+                let name = &parameter.name;
+                work.note(format!(
+                    "{name} has the effect {read}, and {written} was written"
+                ))
+                .await;
+            }
+        }
+    }
+
+    async fn results(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, String> {
+        work.progress(1.0);
+        // The procedure is done; a command that stays in place is removed by the next run.
+        let _removed = shake.withdraw().await;
+        let mut results = Vec::new();
+        for output in outputs(&self.service, &self.procedure) {
+            let Some(node) = &output.node else { continue };
+            let read = self.nodes.read(&[node]).await?;
+            let value = read.into_iter().next().flatten();
+            let value = value.ok_or_else(|| format!("the result {} has no value", output.name))?;
+            let value = match (output.kind, value.as_f64()) {
+                (mtp::ValueKind::Analog, Some(number)) => Value::Double(number),
+                _ => value,
+            };
+            results.push((output.name.clone(), value));
+        }
+        Ok(results)
+    }
+}
+
+/// The parameter of procedures that do not complete by themselves.
+pub(super) const RUN_TIME: &str = "RunTime";

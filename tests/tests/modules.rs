@@ -1,0 +1,505 @@
+//! Process modules: manifests compared with another XML library and with rdflib, and services that
+//! run as skills with a simulated module.
+
+use std::collections::BTreeMap;
+use std::process::{Command, Output};
+use std::time::Duration;
+
+use knowledge::{Knowledge, Question, Source, SourceKind};
+use mtp::Module;
+use serde_json::{Value, json};
+use system_tests::{Cell, Child, Peer, Started, eventually, http_get, program};
+use test_data::{foreign, own};
+
+const SOON: Duration = Duration::from_secs(30);
+const AT: &str = "127.0.0.1:8087";
+
+/// Runs `ua-space` to its end.
+fn space(args: &[&str]) -> Output {
+    Command::new(program("ua-space"))
+        .args(args)
+        .output()
+        .unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// Returns the rows of a question about manifests that are in the graph as `urn:m:<number>`.
+fn rows(knowledge: &Knowledge, question: &str, parameters: &[(&str, &str)]) -> Vec<Value> {
+    let parameters: Vec<(String, String)> = parameters
+        .iter()
+        .map(|(name, value)| ((*name).to_owned(), (*value).to_owned()))
+        .collect();
+    let answer = knowledge.ask(question, &parameters).unwrap();
+    let rows = answer.rows.into_iter();
+    rows.map(|row| serde_json::to_value(row).unwrap()).collect()
+}
+
+/// Returns the sorted values of columns.
+fn columns(rows: &[Value], names: &[&str]) -> Vec<Value> {
+    let mut found: Vec<Value> = rows
+        .iter()
+        .map(|row| names.iter().map(|name| row[name].clone()).collect())
+        .collect();
+    found.sort_by_key(Value::to_string);
+    found
+}
+
+fn sorted(mut all: Vec<Value>) -> Vec<Value> {
+    all.sort_by_key(Value::to_string);
+    all
+}
+
+/// Returns an identifier without the namespace index that some manifests repeat in it.
+fn identifier(of: &Value) -> Option<String> {
+    let text = of.as_str()?;
+    let rest = text
+        .split_once(';')
+        .filter(|(start, _)| start.starts_with("ns="));
+    let text = rest.map_or(text, |(_, rest)| rest.trim_start_matches("s="));
+    Some(text.to_owned())
+}
+
+/// Returns the identifier in a NodeId of an answer.
+fn of_node(node: &Value) -> Option<String> {
+    let (_, rest) = node.as_str()?.split_once(';')?;
+    let (_, identifier) = rest.split_once('=')?;
+    Some(identifier.to_owned())
+}
+
+#[test]
+fn nine_questions_are_answered_as_the_xml_says() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let names = ["stage.aml", "mixer.aml", "column.aml"];
+    let files = names.map(|name| own(&format!("mtp/{name}")));
+    let paths: Vec<String> = files
+        .iter()
+        .map(|path| path.display().to_string())
+        .collect();
+    are_answered(&cell, &paths);
+}
+
+#[test]
+fn nine_questions_about_modules_of_other_makers_are_answered_as_the_xml_says() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let names = [
+        "cps-edp-mixing-1.1.2/Manifest.aml",
+        "huber-v14.1/Manifest.aml",
+        "mtppy-recipe/example_recipe_manifest.aml",
+        "p2o-bucket/Manifest.aml",
+        "p2o-dosing-1.0.3/Manifest.aml",
+        "pimad-core/PiMAd-core.0-0-1.aml",
+        "recipol-hc30-siemens/2026-05-18-HC30_Stirring_V8.aml",
+        "zvei-stirred-reactor-v1/Manifest.aml",
+    ];
+    let files = names.map(|name| foreign(&format!("mtp/{name}")));
+    let paths: Option<Vec<String>> = files
+        .into_iter()
+        .map(|path| path.map(|path| path.display().to_string()))
+        .collect();
+    let Some(paths) = paths else { return };
+    are_answered(&cell, &paths);
+}
+
+/// Compares the answers of the nine questions with the XML of manifests.
+fn are_answered(cell: &Cell, paths: &[String]) {
+    let args: Vec<&str> = paths.iter().map(String::as_str).collect();
+    let judged = cell.asyncua_once("mtp_judge.py", &args);
+    assert_eq!(judged.len(), paths.len());
+    let knowledge = Knowledge::new().unwrap();
+    let mut services_of = BTreeMap::new();
+    for (number, path) in paths.iter().enumerate() {
+        let module = Module::from_bytes(&std::fs::read(path).unwrap()).unwrap();
+        let triples = module.triples(&format!("urn:m:{number}"), &BTreeMap::new());
+        let source = Source::new(SourceKind::Mtp, &number.to_string());
+        knowledge.replace(&source, &triples, 1).unwrap();
+        services_of.insert(number, module.services);
+    }
+    for (number, wanted) in judged.iter().enumerate() {
+        let module = format!("urn:m:{number}");
+        components_are(&knowledge, &module, wanted);
+        variables_are(&knowledge, &module, wanted);
+        for service in wanted["services"].as_array().unwrap() {
+            let of_module = services_of[&number].iter();
+            let mut of_name = of_module.filter(|one| json!(one.name) == service["name"]);
+            let known = of_name.next().unwrap();
+            let service_iri = format!("{module}/service/{}", mtp::escaped(&known.id));
+            service_is(&knowledge, &service_iri, known, service);
+        }
+        let mut services = Vec::new();
+        for service in wanted["services"].as_array().unwrap() {
+            for procedure in service["procedures"].as_array().unwrap() {
+                let name = format!(
+                    "{}/{}",
+                    service["name"].as_str().unwrap(),
+                    procedure["name"].as_str().unwrap()
+                );
+                services.push(json!([service["name"], name, procedure["number"]]));
+            }
+        }
+        let found = rows(&knowledge, "services-of", &[("module", &module)]);
+        let names = ["service_name", "procedure_name", "number"];
+        assert_eq!(columns(&found, &names), sorted(services), "{module}");
+    }
+}
+
+/// Checks components-of and modules-with.
+fn components_are(knowledge: &Knowledge, module: &str, wanted: &Value) {
+    let found = rows(knowledge, "components-of", &[("module", module)]);
+    let of_kind = |kind: &str| {
+        let rows: Vec<Value> = found
+            .iter()
+            .filter(|row| row["kind"] == kind)
+            .cloned()
+            .collect();
+        columns(&rows, &["name"])
+    };
+    let names = |key: &str| {
+        let all = wanted[key].as_array().unwrap().iter();
+        sorted(all.map(|name| json!([name])).collect())
+    };
+    assert_eq!(of_kind("sensor"), names("sensors"), "{module}");
+    assert_eq!(of_kind("server"), names("servers"), "{module}");
+    let actuators = wanted["actuators"].as_array().unwrap();
+    let of_actuators = actuators.iter().map(|one| json!([one[0]]));
+    assert_eq!(
+        of_kind("actuator"),
+        sorted(of_actuators.collect()),
+        "{module}"
+    );
+    let services = wanted["services"].as_array().unwrap();
+    let of_services = services.iter().map(|one| json!([one["name"]]));
+    assert_eq!(
+        of_kind("service"),
+        sorted(of_services.collect()),
+        "{module}"
+    );
+    let assemblies = found.iter().filter(|row| {
+        ["sensor", "actuator", "data assembly"].contains(&row["kind"].as_str().unwrap())
+    });
+    assert_eq!(json!(assemblies.count()), wanted["assemblies"], "{module}");
+    for actuator in actuators {
+        let kind = actuator[1].as_str().unwrap();
+        let with = rows(knowledge, "modules-with", &[("what", kind)]);
+        let is_there = with.iter().any(|row| {
+            row["module"] == wanted["module"]
+                && row["name"] == actuator[0]
+                && row["kind"] == "actuator"
+        });
+        assert!(is_there, "{module} {actuator}: {with:?}");
+    }
+    for service in services {
+        let name = service["name"].as_str().unwrap();
+        let with = rows(knowledge, "modules-with", &[("what", name)]);
+        let is_there = with
+            .iter()
+            .any(|row| row["module"] == wanted["module"] && row["kind"] == "service");
+        assert!(is_there, "{module} {name}: {with:?}");
+    }
+}
+
+/// Checks access-of for every node of a module.
+fn variables_are(knowledge: &Knowledge, module: &str, wanted: &Value) {
+    let start = format!("{module}/item/");
+    let mut all = rows(knowledge, "access-of", &[]);
+    all.retain(|row| row["of"].as_str().is_some_and(|of| of.starts_with(&start)));
+    let names = ["name", "endpoint", "namespace_uri", "identifier", "access"];
+    let found = columns(&all, &names);
+    let access = |bits: &Value| match bits.as_u64() {
+        Some(1) => "read",
+        Some(2) => "write",
+        Some(3) => "read and write",
+        _ => "none",
+    };
+    let expected = wanted["access"].as_array().unwrap().iter().map(|item| {
+        let identifier = identifier(&item[3]).unwrap();
+        let is_number = all.iter().any(|row| {
+            row["name"] == item[0] && row["identifier"] == json!(format!("i={identifier}"))
+        });
+        let kind = if is_number { "i" } else { "s" };
+        json!([
+            item[0],
+            item[1].as_str().unwrap_or_default(),
+            item[2],
+            format!("{kind}={identifier}"),
+            access(&item[4])
+        ])
+    });
+    assert_eq!(found, sorted(expected.collect()), "{module}");
+}
+
+/// Checks state-of, skills-for, transitions-now, parameters-of and outputs-of for the skills of a
+/// service.
+fn service_is(knowledge: &Knowledge, service_iri: &str, known: &mtp::Service, wanted: &Value) {
+    let capability = format!("{service_iri}/capability");
+    let skills = rows(knowledge, "skills-for", &[("capability", &capability)]);
+    let procedures = wanted["procedures"].as_array().unwrap();
+    let names = procedures.iter().map(|procedure| {
+        let name = procedure["name"].as_str().unwrap();
+        json!([format!("{}/{name}", known.name)])
+    });
+    assert_eq!(
+        columns(&skills, &["skill_name"]),
+        sorted(names.collect()),
+        "{service_iri}"
+    );
+    for (procedure, wanted_procedure) in known.procedures.iter().zip(procedures) {
+        assert_eq!(json!(procedure.name), wanted_procedure["name"]);
+        let skill = format!("{service_iri}/procedure/{}", mtp::escaped(&procedure.id));
+        let state = rows(knowledge, "state-of", &[("skill", &skill)]);
+        assert_eq!(state.len(), 1, "{skill}");
+        assert_eq!(
+            of_node(&state[0]["node"]),
+            identifier(&wanted["state"]),
+            "{skill}"
+        );
+        let idle = [("skill", &*skill), ("state", "Idle")];
+        let transitions = rows(knowledge, "transitions-now", &idle);
+        assert_eq!(
+            columns(&transitions, &["command", "value", "target"]),
+            [
+                json!(["Abort", 256, "Aborting"]),
+                json!(["Start", 4, "Starting"]),
+                json!(["Stop", 8, "Stopping"])
+            ],
+            "{skill}"
+        );
+        let command = identifier(&wanted["command"]);
+        assert!(
+            transitions
+                .iter()
+                .all(|row| of_node(&row["node"]) == command)
+        );
+        let none = rows(knowledge, "transitions-now", &[("skill", &skill)]);
+        assert_eq!(none, Vec::<Value>::new(), "the state is unknown");
+        parameters_are(knowledge, &skill, wanted, wanted_procedure);
+    }
+}
+
+fn parameters_are(knowledge: &Knowledge, skill: &str, service: &Value, wanted: &Value) {
+    let number = |value: &Value| json!(value.as_f64());
+    let mut found: Vec<Value> = rows(knowledge, "parameters-of", &[("skill", skill)])
+        .iter()
+        .map(|row| {
+            let nodes = ["node", "min_node", "max_node"].map(|name| of_node(&row[name]));
+            json!([row["name"], nodes, number(&row["min"]), number(&row["max"])])
+        })
+        .collect();
+    found.sort_by_key(Value::to_string);
+    let mut expected: Vec<Value> = wanted["parameters"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|one| {
+            let nodes = ["node", "min_node", "max_node"].map(|name| identifier(&one[name]));
+            json!([one["name"], nodes, number(&one["min"]), number(&one["max"])])
+        })
+        .collect();
+    if let Some(selection) = identifier(&service["selection"]) {
+        expected.push(json!(["ProcedureExt", [selection, null, null], null, null]));
+    }
+    assert_eq!(found, sorted(expected), "{skill}");
+    let outputs = rows(knowledge, "outputs-of", &[("skill", skill)]);
+    let mut named = columns(&outputs, &["name"]);
+    named.dedup();
+    let of_service = service["variables"].as_array().unwrap().iter();
+    let of_procedure = wanted["outputs"].as_array().unwrap().iter();
+    let expected = of_service
+        .map(|name| json!([name]))
+        .chain(of_procedure.map(|one| json!([one["name"]])));
+    assert_eq!(named, sorted(expected.collect()), "{skill}");
+}
+
+#[test]
+fn verbs_show_manifests_and_report_what_is_left_out() {
+    let column = own("mtp/column.aml").display().to_string();
+    let checked = space(&["mtp", "check", "--json", &column]);
+    assert!(checked.status.success(), "{checked:?}");
+    let checked: Value = serde_json::from_str(&stdout(&checked)).unwrap();
+    let numbers = ["services", "procedures", "sensors", "actuators", "nodes"];
+    let numbers = numbers.map(|name| checked[name].as_u64().unwrap());
+    assert_eq!(numbers, [2, 3, 6, 5, 117], "{checked}");
+    assert_eq!(checked["findings"][0]["severity"], "note");
+    let skills = space(&["mtp", "skills", "--json", &column]);
+    let skills: Value = serde_json::from_str(&stdout(&skills)).unwrap();
+    assert_eq!(skills[0]["skill"], "Heating/Ramp", "{skills}");
+    assert_eq!(skills[0]["parameters"][0]["unit"], "°C", "{skills}");
+    let table = stdout(&space(&["mtp", "skills", &column]));
+    assert!(table.contains("Setpoint: Float [20..120] °C"), "{table}");
+    let rdf = stdout(&space(&[
+        "mtp",
+        "rdf",
+        &column,
+        "--base",
+        "urn:example:column",
+    ]));
+    let knowledge = Knowledge::new().unwrap();
+    let source = Source::new(SourceKind::File, "column.nt");
+    knowledge.replace_turtle(&source, &rdf, 1).unwrap();
+    assert_eq!(rows(&knowledge, "services-of", &[]).len(), 3);
+
+    let broken = std::fs::read_to_string(&column).unwrap();
+    let Some(cell) = Cell::with(&[]) else { return };
+    let broken = broken.replacen("<Value>n-Level.V</Value>", "<Value>n-gone</Value>", 1);
+    let broken = cell.file("broken.aml", &broken).display().to_string();
+    let refused = space(&["mtp", "check", &broken]);
+    assert_eq!(refused.status.code(), Some(65));
+    let said = stdout(&refused);
+    assert!(
+        said.contains("Level.V: it refers to an ID that no OPCUAItem has"),
+        "{said}"
+    );
+    assert_eq!(
+        space(&["mtp", "check", "/nowhere.aml"]).status.code(),
+        Some(74)
+    );
+}
+
+/// Starts the simulated module of a manifest of the tests.
+fn simulated(manifest: &str, more: &[&str]) -> Child {
+    let path = own(&format!("mtp/{manifest}")).display().to_string();
+    let mut child = Started::new("pea", &program("ua-space"))
+        .args(["pea", &path, "--listen", "opc.tcp://127.0.0.1:4840"])
+        .args(["--acting", "0.05", "--executing", "0.2"])
+        .args(more)
+        .start();
+    child.wait_for_line(" is at opc.tcp://", SOON);
+    child
+}
+
+/// Starts the component with the services of a manifest as skills.
+fn component(cell: &Cell, manifest: &str, capabilities: &str) -> Child {
+    let path = own(&format!("mtp/{manifest}")).display().to_string();
+    let text = format!(
+        "component: module\napplication_uri: urn:example:module\nnamespace: 51\nsecurity: [None]\n\
+         device:\n  mtp:\n    manifest: {path}\n    capabilities: {capabilities}\n"
+    );
+    let path = cell.file("module.yaml", &text).display().to_string();
+    Started::new("component", &program("ua-component"))
+        .args([&path, "--interface", "lo", "--lds", "none"])
+        .start()
+}
+
+#[test]
+fn a_service_of_a_module_is_called_as_a_skill() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let _module = simulated("stage.aml", &[]);
+    let _component = component(&cell, "stage.aml", "{}");
+    let call = |parameters: &[&str]| {
+        let args = [
+            "call",
+            "--interface",
+            "lo",
+            "--wait",
+            "30",
+            "--timeout",
+            "30",
+        ];
+        space(&[&args[..], parameters].concat())
+    };
+    let polka = call(&["module.Solo-Polka"]);
+    assert!(polka.status.success(), "{polka:?}");
+    let tango = ["module.Duet-Tango", "Tempo=42.5", "Turns=7", "RunTime=0.2"];
+    let tango = call(&tango);
+    assert!(tango.status.success(), "{tango:?}");
+    let high = ["module.Duet-Tango", "Tempo=42.5", "Turns=700"];
+    let high = call(&high);
+    assert_eq!(high.status.code(), Some(1), "{high:?}");
+    let said = stdout(&high) + &String::from_utf8_lossy(&high.stderr);
+    assert!(said.contains("Turns is from"), "{said}");
+    let info = space(&["skills", "info", "module.Duet-Tango", "--interface", "lo"]);
+    assert!(stdout(&info).contains("Tempo"), "{info:?}");
+}
+
+#[test]
+fn a_service_of_a_module_is_a_step_of_a_process_and_its_state_is_in_the_graph() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let _module = simulated("stage.aml", &[]);
+    let dance = "urn:example:capability:dance";
+    let _component = component(&cell, "stage.aml", &format!("{{Solo/Polka: [{dance}]}}"));
+    let manifest = own("mtp/stage.aml").display().to_string();
+    let text = format!(
+        "mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\nsecurity: [None]\n\
+         endpoint: opc.tcp://127.0.0.1:0\nsparql: {AT}\n\
+         manifests:\n  - {{name: stage, file: {manifest}, connect: true, capabilities: {{Solo/Polka: [{dance}]}}}}\n\
+         processes:\n  - process: urn:example:process:show\n    wait: 60 s\n    steps:\n      - {{step: dance, needs: {{skill: {dance}}}}}\n"
+    );
+    let path = cell.file("mes.yaml", &text).display().to_string();
+    let _mes = Started::new("mes", &program("ua-mes"))
+        .args([&path, "--interface", "lo", "--lds", "none"])
+        .args(["--run", "urn:example:process:show"])
+        .start();
+    let get = |path: &str| -> Option<Value> { serde_json::from_str(&http_get(AT, path)?).ok() };
+    let run = eventually("the process is done", SOON, || {
+        let run = get("/status")?["runs"][0].clone();
+        run["ended_ms"].is_number().then_some(run)
+    });
+    assert_eq!(run["outcome"], "done", "{run}");
+    let row = eventually("the state of the service is in the graph", SOON, || {
+        let answer = get("/ask/state-of?skill=Solo/Polka")?;
+        let row = answer["rows"][0].clone();
+        (row["state"] == "Completed").then_some(row)
+    });
+    assert_eq!(row["value"], 131_072, "{row}");
+    let transitions = get("/ask/transitions-now?skill=Solo/Polka").unwrap();
+    let commands = columns(
+        transitions["rows"].as_array().unwrap(),
+        &["command", "value"],
+    );
+    assert_eq!(
+        commands,
+        [
+            json!(["Abort", 256]),
+            json!(["Reset", 2]),
+            json!(["Stop", 8])
+        ]
+    );
+    let skill = get("/ask/state-of?skill=Solo-Polka").unwrap();
+    assert_eq!(skill["rows"][0]["state"], "Ready", "{skill}");
+    let shown = Command::new(program("ua-space"))
+        .args(["ask", "state-of", "Solo/Polka", "--json"])
+        .output()
+        .unwrap();
+    assert!(stdout(&shown).contains("Completed"), "{shown:?}");
+}
+
+#[test]
+fn asyncua_sees_the_simulated_module_follow_the_handshake() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _module = simulated("column.aml", &[]);
+    let manifest = own("mtp/column.aml").display().to_string();
+    let args = ["opc.tcp://127.0.0.1:4840", &manifest, "Draining"];
+    let said = cell.asyncua_once("pea_judge.py", &args);
+    let said = said.first().unwrap();
+    assert_eq!(said["read"], 117, "{said}");
+    assert_eq!(said["unreadable"], json!([]), "{said}");
+    // A command without automatic mode has no effect.
+    assert_eq!(said["without_handshake"], 16, "{said}");
+    assert_eq!(said["states"], json!([8, 64, 65536, 131_072]), "{said}");
+    assert_eq!(said["command"], 0, "{said}");
+}
+
+#[test]
+fn nine_questions_have_names() {
+    for name in [
+        "components-of",
+        "state-of",
+        "services-of",
+        "skills-for",
+        "transitions-now",
+        "parameters-of",
+        "outputs-of",
+        "access-of",
+        "modules-with",
+    ] {
+        assert!(!Question::of(name).unwrap().about().is_empty(), "{name}");
+    }
+}
