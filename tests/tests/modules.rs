@@ -460,8 +460,10 @@ fn a_service_of_a_module_is_a_step_of_a_process_and_its_state_is_in_the_graph() 
             json!(["Stop", 8])
         ]
     );
-    let skill = get("/ask/state-of?skill=Solo-Polka").unwrap();
-    assert_eq!(skill["rows"][0]["state"], "Ready", "{skill}");
+    eventually("the state of the skill is in the graph", SOON, || {
+        let skill = get("/ask/state-of?skill=Solo-Polka")?;
+        (skill["rows"][0]["state"] == "Ready").then_some(())
+    });
     let shown = Command::new(program("ua-space"))
         .args(["ask", "state-of", "Solo/Polka", "--json"])
         .output()
@@ -483,7 +485,10 @@ fn asyncua_sees_the_simulated_module_follow_the_handshake() {
     assert_eq!(said["unreadable"], json!([]), "{said}");
     // A command without automatic mode has no effect.
     assert_eq!(said["without_handshake"], 16, "{said}");
-    assert_eq!(said["states"], json!([8, 64, 65536, 131_072]), "{said}");
+    // The states follow each other by growing words; a short state may be missed.
+    let states = said["states"].as_array().unwrap();
+    assert!(states.is_sorted_by_key(Value::as_u64), "{said}");
+    assert_eq!(states.last(), Some(&json!(131_072)), "{said}");
     assert_eq!(said["command"], 0, "{said}");
 }
 

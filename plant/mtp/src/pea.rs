@@ -218,15 +218,13 @@ impl Pea {
         };
         let (state, spent) = (service.state, self.now.saturating_sub(service.since));
         let is_self_completing = service.procedures.get(&service.current) == Some(&true);
-        let next = match state {
-            State::Execute if is_self_completing && spent >= self.executing => State::Completing,
-            State::Execute => return,
-            acting if spent >= self.acting => match acting.next() {
-                Some(next) => next,
-                None => return,
-            },
-            _ => return,
+        let next = if state == State::Execute {
+            let is_over = is_self_completing && spent >= self.executing;
+            is_over.then_some(State::Completing)
+        } else {
+            state.next().filter(|_| spent >= self.acting)
         };
+        let Some(next) = next else { return };
         if self.faults.stuck_in == Some(state) {
             return;
         }
@@ -274,8 +272,11 @@ impl Pea {
             .map(|(role, _)| *role);
         let word = match self.values.get(item) {
             Some(PeaValue::Word(word)) => *word,
-            Some(PeaValue::Boolean(true)) => 1,
-            _ => 0,
+            Some(PeaValue::Boolean(is_set)) => u32::from(*is_set),
+            Some(
+                PeaValue::Byte(_) | PeaValue::Integer(_) | PeaValue::Number(_) | PeaValue::Text(_),
+            )
+            | None => 0,
         };
         let is_effective = service.is_automatic && service.is_external;
         match role {
@@ -355,9 +356,11 @@ impl Pea {
                 changes.push((item.to_owned(), PeaValue::Boolean(false)));
             }
             if let Some(name) = parameter.modes.name_of(item).filter(|_| is_set) {
-                let shown = match asked(name) {
-                    (true, _) => "StateAutAct",
-                    _ => "SrcExtAct",
+                let (automatic, _) = asked(name);
+                let shown = if automatic {
+                    "StateAutAct"
+                } else {
+                    "SrcExtAct"
                 };
                 let shown = parameter.modes.nodes.get(shown).cloned();
                 changes.extend(shown.map(|to| (to, PeaValue::Boolean(true))));
@@ -567,7 +570,7 @@ fn initial(assembly: &DataAssembly, name: &str) -> PeaValue {
             Some(ValueKind::Text) => PeaValue::Text(String::new()),
             Some(ValueKind::Binary) | None => PeaValue::Boolean(false),
         },
-        () if NUMBERS.iter().any(|start| name.starts_with(start)) => PeaValue::Number(0.0),
+        () if NUMBERS.contains(&name) => PeaValue::Number(0.0),
         () => PeaValue::Boolean(name == "ApplyEn" || name.ends_with("ApplyEn")),
     }
 }
@@ -594,8 +597,10 @@ impl Bound {
 
 /// Requests of modes from outside.
 const REQUESTS: [&str; 4] = ["StateAutOp", "StateAutAut", "SrcExtOp", "SrcExtAut"];
-/// Beginnings of the names of variables that are numbers.
-const NUMBERS: [&str; 8] = ["Rpm", "Pos", "MV", "SP", "PV", "P", "Ti", "Td"];
+/// Variables of actuators and controllers that are numbers.
+const NUMBERS: [&str; 10] = [
+    "Rpm", "RpmFbk", "Pos", "PosFbk", "MV", "SP", "PV", "P", "Ti", "Td",
+];
 /// Bits of the word OpMode of early drafts.
 pub const OP_MODE_AUTOMATIC: u32 = 64;
 /// The bit of active automatic mode.

@@ -233,12 +233,8 @@ impl Graph<'_> {
             }
             self.link(&skill, v::BEHAVIOR_CONFORMS_TO, &machine);
             self.link(&skill, v::PAPER_HAS_STATE_MACHINE, &machine);
-            for (predicate, variable) in &variables {
+            for (predicate, variable) in variables.iter().chain(&outputs) {
                 self.link(&skill, predicate, variable);
-            }
-            for output in &outputs {
-                self.link(&skill, v::HAS_OUTPUT_PARAMETER, output);
-                self.link(&skill, v::PAPER_HAS_OUTPUT, output);
             }
             let equipment = service.equipment.iter().chain(&procedure.equipment);
             for id in equipment {
@@ -303,9 +299,8 @@ impl Graph<'_> {
             self.link(&iri, v::HAS_INPUT_PARAMETER, &parameter);
             self.link(&iri, v::PAPER_HAS_PARAMETER, &parameter);
         }
-        for output in self.outputs(&iri, &about, &procedure.outputs) {
-            self.link(&iri, v::HAS_OUTPUT_PARAMETER, &output);
-            self.link(&iri, v::PAPER_HAS_OUTPUT, &output);
+        for (predicate, output) in self.outputs(&iri, &about, &procedure.outputs) {
+            self.link(&iri, predicate, &output);
         }
         iri
     }

@@ -55,7 +55,12 @@ impl Graph<'_> {
         let classes: &[&str] = match assembly.family {
             Family::Sensor => &[v::SENSOR, v::PAPER_SENSOR],
             Family::Actuator => &[v::ACTUATOR, v::PAPER_ACTUATOR],
-            _ => &[],
+            Family::Parameter
+            | Family::Input
+            | Family::Service
+            | Family::Diagnostic
+            | Family::Information
+            | Family::Other => &[],
         };
         self.is_a(&iri, classes);
         if !classes.is_empty() {
@@ -106,13 +111,26 @@ impl Graph<'_> {
         }
     }
 
-    /// Adds the outputs of a service or a procedure. Returns their IRIs.
-    pub(crate) fn outputs(&mut self, of: &str, about: &str, outputs: &[Output]) -> Vec<String> {
+    /// Adds the outputs of a service or a procedure, and the process values that it reads. Returns
+    /// the relation of each to the skills.
+    pub(crate) fn outputs(
+        &mut self,
+        of: &str,
+        about: &str,
+        outputs: &[Output],
+    ) -> Vec<(&'static str, String)> {
         let mut iris = Vec::new();
         for output in outputs {
             let iri = self.name(of, "output", &output.id, &output.name);
             self.output(&iri, &format!("{about}.{}", output.name), output);
-            iris.push(iri);
+            let [own, paper] = match output.role {
+                OutputRole::ProcessValueIn => [v::HAS_INPUT_PARAMETER, v::PAPER_HAS_PARAMETER],
+                OutputRole::Report | OutputRole::ProcessValueOut => {
+                    [v::HAS_OUTPUT_PARAMETER, v::PAPER_HAS_OUTPUT]
+                }
+            };
+            iris.push((own, iri.clone()));
+            iris.push((paper, iri));
         }
         iris
     }

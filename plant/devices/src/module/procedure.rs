@@ -173,8 +173,10 @@ impl Run {
                     }
                     let is_over = !run_time.is_zero() && executed >= run_time;
                     if is_over && !is_completing {
-                        shake.allowed(Command::Complete).await?;
-                        shake.command(Command::Complete).await?;
+                        if let Err(why) = complete(shake).await {
+                            let end = self.stop(shake, work).await;
+                            return Err(format!("{why}; {end}"));
+                        }
                         is_completing = true;
                     }
                 }
@@ -190,8 +192,14 @@ impl Run {
             tokio::select! {
                 biased;
                 () = work.held() => {
-                    if work.is_stopped() || self.suspend(shake, work).await?.is_some() {
-                        return Err(self.stop(shake, work).await);
+                    let why = match work.is_stopped() {
+                        true => Some(String::new()),
+                        false => self.suspend(shake, work).await.err(),
+                    };
+                    // The service does not run on without its skill.
+                    if let Some(why) = why {
+                        let end = self.stop(shake, work).await;
+                        return Err(if why.is_empty() { end } else { format!("{why}; {end}") });
                     }
                 }
                 () = sleep(self.timing.poll) => {}
@@ -208,9 +216,11 @@ impl Run {
         }
     }
 
-    /// Pauses or holds the service, and continues it. Returns `Some` if the run was stopped
-    /// meanwhile.
-    async fn suspend(&self, shake: &Handshake<'_>, work: &Work) -> Result<Option<()>, String> {
+    /// Pauses or holds the service, and continues it.
+    ///
+    /// # Errors
+    /// The service did neither, or the run was stopped meanwhile; then the text is empty.
+    async fn suspend(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), String> {
         let can_pause = shake.allows(Command::Pause).await?;
         let (command, rest, resume) = match can_pause {
             true => (Command::Pause, State::Paused, Command::Resume),
@@ -223,11 +233,11 @@ impl Run {
         let reached = shake.until(is_at_rest, within).await?;
         shake.withdraw().await?;
         if reached == StateWord::Known(State::Completed) {
-            return Ok(None);
+            return Ok(());
         }
         work.step(rest.name()).await;
         if work.going().await.is_err() {
-            return Ok(Some(()));
+            return Err(String::new());
         }
         shake.allowed(resume).await?;
         shake.command(resume).await?;
@@ -235,8 +245,7 @@ impl Run {
         shake
             .until(|state| state != StateWord::Known(rest), within)
             .await?;
-        shake.withdraw().await?;
-        Ok(None)
+        shake.withdraw().await
     }
 
     /// Stops the service: Stop, or Abort if Stop is not allowed. Returns the reason for the end.
@@ -309,6 +318,12 @@ impl Run {
         }
         Ok(results)
     }
+}
+
+/// Completes a procedure that does not complete by itself.
+async fn complete(shake: &Handshake<'_>) -> Result<(), String> {
+    shake.allowed(Command::Complete).await?;
+    shake.command(Command::Complete).await
 }
 
 /// The parameter of procedures that do not complete by themselves.
