@@ -86,7 +86,7 @@ fn publish(knowledge: &Knowledge, source: &Source, triples: &[Triple]) {
     }
 }
 
-/// A module whose services are watched.
+/// A module with watched services.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct WatchedModule {
     /// The name of its manifest.

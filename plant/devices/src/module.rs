@@ -1,8 +1,8 @@
 //! Services of a process module (MTP) as skills: each procedure is a skill whose driver performs
 //! the handshake of VDI/VDE/NAMUR 2658-4 with the OPC UA server of the module.
 //!
-//! Reading order: this module (the device), `handshake` (the waits and writes), `procedure` (a run),
-//! `nodes` (the OPC UA client), `types` (the NodeSet with the skill types).
+//! Reading order: this module (the device), `handshake` (the waits and writes), `procedure` (a
+//! run), `nodes` (the OPC UA client), `types` (the NodeSet with the skill types).
 
 mod handshake;
 mod nodes;

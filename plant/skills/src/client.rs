@@ -7,6 +7,7 @@
 //! - `find`: the skills of a server
 //! - `grip`: the grip point of a skill
 //! - `handle`: a skill of a server
+//! - `states`: the states of the skills of a server
 //! - `mirror`: the skills of a server, presented like local skills
 //! - `detector`: the skills of all servers
 //! - `peers`: how the skills of a component reach other components
@@ -26,16 +27,15 @@ mod peers;
 mod remote;
 #[cfg(test)]
 mod secured_tests;
+mod states;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use plant_opcua::client::{
-    CallError, Client, ClientConfig, ClientError, ClientUser, Link, Notice, SecurityChoice,
-    Subscription, Watch,
+    CallError, Client, ClientConfig, ClientError, ClientUser, Link, SecurityChoice,
 };
 use plant_opcua::types::StatusCode;
-use program::State;
 
 pub use choice::ToolState;
 pub use detector::{Detected, Detector};
@@ -44,6 +44,7 @@ pub use handle::{RemoteState, SkillHandle};
 pub use mirror::{Mirror, Mirrors, Watchable};
 pub use peers::PeerAccess;
 pub use remote::Remote;
+pub use states::SkillStates;
 
 use crate::parameters::TypeName;
 use crate::runs::SkillFault;
@@ -174,24 +175,6 @@ impl SkillClient {
         SkillHandle::new(self.client.clone(), found.clone())
     }
 
-    /// Subscribes to the states of skills of the server, each by its position.
-    #[must_use]
-    pub fn states(&self, skills: &[FoundSkill]) -> SkillStates {
-        let mut watches = Vec::new();
-        let mut of = Vec::new();
-        for (at, skill) in skills.iter().enumerate() {
-            let mut paths = handle::STATE_PATHS.iter();
-            if let Some(node) = paths.find_map(|path| skill.nodes.get(path)) {
-                watches.push(Watch::Value(node.clone()));
-                of.push(at);
-            }
-        }
-        SkillStates {
-            subscription: self.client.subscribe(watches, STATES, MOST_STATES),
-            of,
-        }
-    }
-
     /// Completes when the connection is lost, with the reason.
     pub async fn lost(&self) -> String {
         let mut link = self.client.link();
@@ -209,32 +192,6 @@ impl SkillClient {
         self.client.close().await;
     }
 }
-
-/// The states of skills, as the server publishes them.
-pub struct SkillStates {
-    subscription: Subscription,
-    of: Vec<usize>,
-}
-
-impl SkillStates {
-    /// Returns the next state, with the position of its skill; `None` when the client is closed.
-    pub async fn next(&mut self) -> Option<(usize, State)> {
-        loop {
-            let Notice::Value { watch, value } = self.subscription.next().await? else {
-                continue;
-            };
-            let state = value.value.as_ref().and_then(handle::state_in);
-            if let (Some(at), Some(state)) = (self.of.get(watch), state) {
-                return Some((*at, state));
-            }
-        }
-    }
-}
-
-/// Publishing interval of the states of skills.
-const STATES: Duration = Duration::from_millis(50);
-/// Maximum number of states that wait to be read.
-const MOST_STATES: usize = 4096;
 
 /// Waits for the first connection. A refused certificate is reported at once, because it stays
 /// refused until an operator trusts it.

@@ -34,7 +34,7 @@ pub trait Device: Debug + Send + Sync {
         Vec::new()
     }
 
-    /// Returns the skills of a component whose description names none.
+    /// Returns the skills of a component without `skills` in its description.
     fn skills(&self) -> Vec<SkillSetup> {
         Vec::new()
     }
