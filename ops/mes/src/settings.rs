@@ -13,7 +13,7 @@ use skills::{Lds, Security, TypeName};
 
 use crate::process::{By, Given, Job, Need, Process, Role, Step};
 
-pub(crate) use files::{Manifest, RmlSource, Source};
+pub(crate) use files::{Connect, Manifest, RmlSource, Source};
 
 /// The settings of the MES.
 #[derive(Debug, Clone)]

@@ -3,8 +3,8 @@
 mod cell;
 mod discover;
 mod live;
-mod recording;
 mod module;
+mod recording;
 mod write;
 
 pub(crate) use cell::{Doctor, DriverTemplate, New, StatusArguments, Template};
