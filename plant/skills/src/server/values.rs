@@ -395,6 +395,7 @@ mod tests {
         fn read(
             &self,
             _node: &crate::yaml::Node,
+            _folder: &Path,
             _reader: &mut crate::yaml::Reader<'_>,
         ) -> Option<Arc<dyn Device>> {
             Some(Arc::new(Scale))
