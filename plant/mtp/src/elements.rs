@@ -157,9 +157,9 @@ impl<'a> Reading<'a> {
         let texts: BTreeMap<&str, &str> = root
             .all()
             .filter(|one| matches!(one.kind(), "AlarmMessage" | "AlarmText"))
-            .filter_map(|one| {
+            .map(|one| {
                 let text = one.value(&["Text", "AlarmText", "Message", "Value"]);
-                Some((&*one.id, text.unwrap_or(&one.name)))
+                (&*one.id, text.unwrap_or(&one.name))
             })
             .collect();
         let mut alarms = Vec::new();

@@ -198,9 +198,9 @@ impl Graph<'_> {
                 .procedures
                 .iter()
                 .any(|procedure| procedure.is_self_completing);
-            let next = match state {
-                State::Execute if is_self_completing => Some(State::Completing),
-                state => state.next(),
+            let next = match *state == State::Execute && is_self_completing {
+                true => Some(State::Completing),
+                false => state.next(),
             };
             followers.extend(next.map(|next| ("Done".to_owned(), next, None)));
             for (name, next, command) in followers {

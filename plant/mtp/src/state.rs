@@ -118,29 +118,30 @@ impl State {
     /// Returns the state that follows a command; `None` if the state does not allow the command.
     #[must_use]
     pub const fn after(self, command: Command) -> Option<Self> {
-        use State as S;
         Some(match (self, command) {
-            (S::Stopped | S::Aborted | S::Completed, Command::Reset) => S::Resetting,
-            (S::Idle, Command::Start) => S::Starting,
-            (S::Execute, Command::Restart) => S::Starting,
-            (S::Execute, Command::Complete) => S::Completing,
-            (S::Execute, Command::Pause) => S::Pausing,
-            (S::Paused, Command::Resume) => S::Resuming,
-            (S::Held, Command::Unhold) => S::Unholding,
+            (Self::Stopped | Self::Aborted | Self::Completed, Command::Reset) => Self::Resetting,
+            (Self::Idle, Command::Start) => Self::Starting,
+            (Self::Execute, Command::Restart) => Self::Starting,
+            (Self::Execute, Command::Complete) => Self::Completing,
+            (Self::Execute, Command::Pause) => Self::Pausing,
+            (Self::Paused, Command::Resume) => Self::Resuming,
+            (Self::Held, Command::Unhold) => Self::Unholding,
             (
-                S::Starting
-                | S::Execute
-                | S::Completing
-                | S::Resuming
-                | S::Paused
-                | S::Pausing
-                | S::Unholding,
+                Self::Starting
+                | Self::Execute
+                | Self::Completing
+                | Self::Resuming
+                | Self::Paused
+                | Self::Pausing
+                | Self::Unholding,
                 Command::Hold,
-            ) => S::Holding,
-            (S::Stopped | S::Stopping | S::Aborting | S::Aborted, Command::Stop) => return None,
-            (_, Command::Stop) => S::Stopping,
-            (S::Aborting | S::Aborted, Command::Abort) => return None,
-            (_, Command::Abort) => S::Aborting,
+            ) => Self::Holding,
+            (Self::Stopped | Self::Stopping | Self::Aborting | Self::Aborted, Command::Stop) => {
+                return None;
+            }
+            (_, Command::Stop) => Self::Stopping,
+            (Self::Aborting | Self::Aborted, Command::Abort) => return None,
+            (_, Command::Abort) => Self::Aborting,
             (
                 _,
                 Command::Reset

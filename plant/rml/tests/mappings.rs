@@ -39,7 +39,7 @@ fn values(mapping: &str, xml: &str) -> Vec<String> {
         .iter()
         .filter_map(|quad| match &quad.object {
             oxrdf::Term::Literal(literal) => Some(literal.value().to_owned()),
-            _ => None,
+            oxrdf::Term::NamedNode(_) | oxrdf::Term::BlankNode(_) => None,
         })
         .collect()
 }
