@@ -205,6 +205,15 @@ variables:
     });
 }
 
+const ALARMS: &str = "
+namespaces:
+  2: urn:ua-bridge:system-tests
+variables:
+  - {node: ns=2;i=30, name: Speed, type: Double, origin: 0, alarm: {high: 5, confirm: true, severity: 700}}
+  - {node: ns=2;i=31, name: Guard, type: Boolean, origin: 0, alarm: {normal: true}}
+server: {security: [None], anonymous: observer}
+";
+
 #[test]
 fn an_operator_acknowledges_and_confirms_an_alarm() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
@@ -212,17 +221,7 @@ fn an_operator_acknowledges_and_confirms_an_alarm() {
     };
     add_user(&cell, "anna", "operator");
     add_user(&cell, "otto", "observer");
-    let mapping = cell.file(
-        "alarms.yaml",
-        "
-namespaces:
-  2: urn:ua-bridge:system-tests
-variables:
-  - {node: ns=2;i=30, name: Speed, type: Double, origin: 0, alarm: {high: 5, confirm: true, severity: 700}}
-  - {node: ns=2;i=31, name: Guard, type: Boolean, origin: 0, alarm: {normal: true}}
-server: {security: [None], anonymous: observer}
-",
-    );
+    let mapping = cell.file("alarms.yaml", ALARMS);
     let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
     eventually("the server answers clients", SOON, || {
         cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])

@@ -233,7 +233,9 @@ fn statement(triple: &Triple) -> Statement<'_> {
             datatype: None,
         },
         Object::Text(text) => literal(text.clone(), None),
-        other => literal(other.lexical(), other.datatype()),
+        other @ (Object::Integer(_) | Object::Number(_) | Object::Boolean(_) | Object::Time(_)) => {
+            literal(other.lexical(), other.datatype())
+        }
     };
     Statement {
         subject: &triple.subject,

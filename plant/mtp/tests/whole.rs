@@ -1,6 +1,5 @@
 //! Every element of a manifest: nodes, servers, sensors, actuators, outputs, equipment, alarms and
 //! the state machine, as a model and as RDF.
-#![expect(clippy::unwrap_used, reason = "a test may")]
 
 use std::collections::{BTreeMap, BTreeSet};
 

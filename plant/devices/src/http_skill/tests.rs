@@ -137,10 +137,11 @@ fn driver(http: &str) -> Result<Arc<dyn Driver>, String> {
     );
     let component = Component::from_yaml_with(&text, Path::new(""), &Kinds)
         .map_err(|findings| findings.render("x.yaml", &text))?;
-    match &component.skills[0].driver {
-        DriverSetup::Given(driver) => Ok(Arc::clone(driver)),
-        other => Err(format!("{other:?}")),
+    let driver = &component.skills[0].driver;
+    if let DriverSetup::Given(driver) = driver {
+        return Ok(Arc::clone(driver));
     }
+    Err(format!("{driver:?}"))
 }
 
 const POLLED: &str = "{start: {url: \"PRESS/start/{Force}\", body: {force: \"{Force}\", text: \"{Force} N\", mode: 2}}, \

@@ -266,7 +266,8 @@ impl Handshake<'_> {
             return Ok(());
         }
         if low.is_some_and(|low| number < low) || high.is_some_and(|high| number > high) {
-            let shown = |limit: Option<f64>| limit.map_or("any".to_owned(), |one| one.to_string());
+            let shown =
+                |limit: Option<f64>| limit.map_or_else(|| "any".to_owned(), |one| one.to_string());
             return Err(format!(
                 "{} is from {} to {} in the module, and {number} was given",
                 parameter.name,
@@ -349,7 +350,7 @@ impl Handshake<'_> {
                 return Ok(());
             }
             if Instant::now() >= end {
-                let found = value.map_or("no value".to_owned(), |value| value.to_string());
+                let found = value.map_or_else(|| "no value".to_owned(), |value| value.to_string());
                 return Err(format!(
                     "{what} was not confirmed within {within:?}: {} has {found}",
                     node.id()
@@ -388,12 +389,14 @@ impl Handshake<'_> {
 
 /// Returns the word in an integer of any type; 0 for other values.
 fn as_word(value: &Value) -> u32 {
-    match value {
-        Value::Boolean(_) | Value::String(_) | Value::Array(..) => 0,
-        number => number
-            .to_json()
-            .as_i64()
-            .and_then(|number| u32::try_from(number).ok())
-            .unwrap_or_default(),
+    if matches!(
+        value,
+        Value::Boolean(_) | Value::String(_) | Value::Array(..)
+    ) {
+        return 0;
     }
+    let number = value.to_json().as_i64();
+    number
+        .and_then(|number| u32::try_from(number).ok())
+        .unwrap_or_default()
 }

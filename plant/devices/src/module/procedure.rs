@@ -72,6 +72,23 @@ impl Run {
         self.nodes.connect(state_node, self.timing.connect).await?;
         work.step("mode and source").await;
         shake.mode().await?;
+        self.make_idle(shake, work).await?;
+        work.step("procedure").await;
+        shake.select(&self.procedure).await?;
+        if !self.parameters.is_empty() {
+            work.step("parameters").await;
+        }
+        for parameter in &self.parameters {
+            let value = work.parameters().get(&parameter.name);
+            let value = value.ok_or_else(|| format!("{} is missing", parameter.name))?;
+            shake.parameter(parameter, value).await?;
+        }
+        work.step("start").await;
+        shake.allowed(Command::Start).await
+    }
+
+    /// Resets a service whose last run has ended.
+    async fn make_idle(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), String> {
         let state = shake.state().await?;
         let is_at_end = matches!(
             state,
@@ -88,25 +105,15 @@ impl Run {
             shake
                 .until(|state| state == StateWord::Known(State::Idle), within)
                 .await?;
-            shake.withdraw().await?;
-        } else if state != StateWord::Known(State::Idle) {
-            return Err(format!(
+            return shake.withdraw().await;
+        }
+        match state == StateWord::Known(State::Idle) {
+            true => Ok(()),
+            false => Err(format!(
                 "the service {} is {state}, so it cannot be started",
                 self.service.name
-            ));
+            )),
         }
-        work.step("procedure").await;
-        shake.select(&self.procedure).await?;
-        if !self.parameters.is_empty() {
-            work.step("parameters").await;
-        }
-        for parameter in &self.parameters {
-            let value = work.parameters().get(&parameter.name);
-            let value = value.ok_or_else(|| format!("{} is missing", parameter.name))?;
-            shake.parameter(parameter, value).await?;
-        }
-        work.step("start").await;
-        shake.allowed(Command::Start).await
     }
 
     /// Starts the procedure. A Start that has no effect is withdrawn.

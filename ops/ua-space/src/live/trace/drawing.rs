@@ -57,11 +57,7 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
     );
     for (at, (name, topic)) in topics.iter().enumerate() {
         let y = HEAD + ROW * count(at);
-        let shown: String = match name.chars().count() > MOST_NAME {
-            true => name.chars().take(MOST_NAME - 1).chain(['…']).collect(),
-            false => name.clone(),
-        };
-        text(LEFT - 10.0, y + 20.0, "", "end", &shown);
+        text(LEFT - 10.0, y + 20.0, "", "end", &abbreviated(name));
         let label = format!("{} + {}", shown_of(&topic.origin), shown_of(&topic.network));
         text(LEFT, y + 38.0, "m", "start", &label);
         let samples = format!(
@@ -91,6 +87,13 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
     }
     svg.push_str("</svg>\n");
     svg
+}
+
+fn abbreviated(name: &str) -> String {
+    match name.chars().count() > MOST_NAME {
+        true => name.chars().take(MOST_NAME - 1).chain(['…']).collect(),
+        false => name.to_owned(),
+    }
 }
 
 fn bar(svg: &mut String, class: &str, (x, y): (f64, f64), (width, height): (f64, f64)) {

@@ -206,7 +206,8 @@ async fn node(client: &Client, found: &ServedValue, url: &str) -> Result<NodeId,
             && (of.namespace_index, of.name.as_ref()) == (namespace, name)
     });
     let nodes: Vec<NodeId> = nodes.map(|reference| reference.node_id.node_id).collect();
-    let same = |node: &&NodeId| node.identifier == Identifier::from(u32::from(identifier));
+    let wanted = Identifier::from(u32::from(identifier));
+    let same = |node: &&NodeId| node.identifier == wanted;
     match nodes.as_slice() {
         [only] => Ok(only.clone()),
         [] => Err(failed("there is no node of this name".to_owned())),
