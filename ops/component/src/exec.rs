@@ -104,12 +104,15 @@ impl Program {
         let parameters: serde_json::Map<String, Json> = parameters
             .map(|(name, value)| (name.clone(), value.to_json()))
             .collect();
-        let mut start =
-            json!({"start": {"skill": self.skill, "run": work.run(), "parameters": parameters}});
+        let mut start = json!({"skill": self.skill, "run": work.run(), "parameters": parameters});
         let configured = work.configuration().iter();
-        for (name, value) in configured {
-            start["start"]["configuration"][name] = value.to_json();
+        let configured: serde_json::Map<String, Json> = configured
+            .map(|(name, value)| (name.clone(), value.to_json()))
+            .collect();
+        if let (false, Some(start)) = (configured.is_empty(), start.as_object_mut()) {
+            start.insert("configuration".to_owned(), Json::Object(configured));
         }
+        let start = json!({"start": start});
         // A program that reads nothing may have written its result and ended.
         let deaf = send(&mut input, &start).await.err();
         let mut until = deaf.as_ref().map(|_| Instant::now() + SENT_WITHIN);

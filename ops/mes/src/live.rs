@@ -141,18 +141,33 @@ pub(crate) async fn module(
         };
         let client = Client::open(config, &endpoint);
         if client.up(CONNECTS).await.is_ok() {
-            info!(module = module.name, endpoint, "a module is connected");
             let forgotten = Forgotten {
                 knowledge: &knowledge,
                 source: &source,
             };
-            watch(&knowledge, &client, &source, &mut services).await;
-            drop(forgotten);
-            info!(module = module.name, endpoint, "a module is disconnected");
+            connected(
+                &forgotten,
+                &client,
+                (&module.name, &endpoint),
+                &mut services,
+            )
+            .await;
         }
         client.close().await;
         tokio::time::sleep(AGAIN).await;
     }
+}
+
+/// Publishes the states of services of a module until the connection is lost.
+async fn connected(
+    to: &Forgotten<'_>,
+    client: &Client,
+    (module, endpoint): (&str, &str),
+    services: &mut BTreeMap<String, Watched>,
+) {
+    info!(module, endpoint, "a module is connected");
+    watch(to.knowledge, client, to.source, services).await;
+    info!(module, endpoint, "a module is disconnected");
 }
 
 /// Returns the services of a module by their IRIs.

@@ -143,9 +143,7 @@ impl Reading<'_> {
         let manifests = manifests
             .map(|node| self.each(node, Self::manifest))
             .unwrap_or_default();
-        let rml = rml
-            .map(|node| self.each(node, Self::rml))
-            .unwrap_or_default();
+        let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
         let processes = processes
             .map(|node| self.each(node, Self::process))
             .unwrap_or_default();

@@ -150,17 +150,7 @@ impl Sources {
         let triples = module.triples(&manifest.iri, &manifest.capabilities);
         self.put(source, &triples, lasting)?;
         for found in &module.findings {
-            let what = found.to_string();
-            match found.is_note {
-                true => info!(manifest = source.name, "{what}"),
-                false => warn!(manifest = source.name, "{what}"),
-            }
-            let found = finding(source, what, false);
-            self.state()
-                .findings
-                .entry(source.clone())
-                .or_default()
-                .push(found);
+            self.found(source, found.to_string(), found.is_note);
         }
         let (name, services) = (&module.name, module.services.len());
         info!(
@@ -170,6 +160,21 @@ impl Sources {
             "a module is in the graph"
         );
         Ok(())
+    }
+
+    /// Records a finding in a manifest that was read.
+    fn found(&self, source: &Source, what: String, is_note: bool) {
+        match is_note {
+            true => info!(manifest = source.name, "{what}"),
+            false => warn!(manifest = source.name, "{what}"),
+        }
+        let found = finding(source, what, false);
+        let mut state = self.state();
+        state
+            .findings
+            .entry(source.clone())
+            .or_default()
+            .push(found);
     }
 
     /// Runs an RML mapping.

@@ -132,7 +132,7 @@ fn state(identity: &Identity, condition: &Condition) -> ConditionState {
 
 /// Parses an event id in hexadecimal.
 fn bytes(text: &str) -> Option<Vec<u8>> {
-    if text.len() > LONGEST_ID || !text.is_ascii() || text.len() % 2 != 0 {
+    if text.len() > LONGEST_ID || !text.is_ascii() || !text.len().is_multiple_of(2) {
         return None;
     }
     let pairs = text.as_bytes().chunks_exact(2);
