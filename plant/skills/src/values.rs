@@ -297,6 +297,8 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(4);
 mod tests {
     use std::sync::atomic::{AtomicU32, Ordering};
 
+    use tokio::sync::Semaphore;
+
     use super::*;
     use crate::value::Builtin;
 
@@ -310,20 +312,23 @@ mod tests {
         })
     }
 
-    /// Measures once in each period. Every third measurement fails.
-    #[derive(Debug, Default)]
-    struct Counter(AtomicU32);
+    /// Measures once for each permit. Every third measurement fails.
+    #[derive(Debug)]
+    struct Counter {
+        count: AtomicU32,
+        permits: Arc<Semaphore>,
+    }
 
     #[async_trait]
     impl Sensor for Counter {
-        async fn measure(&self, period: Duration, out: &Measured) -> String {
+        async fn measure(&self, _period: Duration, out: &Measured) -> String {
             loop {
-                let count = self.0.fetch_add(1, Ordering::Relaxed) + 1;
+                self.permits.acquire().await.unwrap().forget();
+                let count = self.count.fetch_add(1, Ordering::Relaxed) + 1;
                 if count.is_multiple_of(3) {
                     return "unplugged".to_owned();
                 }
                 out.put("Count", Ok(count.into()));
-                sleep(period).await;
             }
         }
 
@@ -358,13 +363,19 @@ mod tests {
         let value = out.add("Count", &facts("Count", Builtin::UInt32));
         assert_eq!(value.reading().value, Err(NOT_MEASURED.to_owned()));
         let mut watch_value = value.watch();
+        let permits = Arc::new(Semaphore::new(0));
+        let counter = Counter {
+            count: AtomicU32::new(0),
+            permits: Arc::clone(&permits),
+        };
         let task = tokio::spawn(watch(
-            Arc::new(Counter::default()),
-            watch::Sender::new(Duration::from_millis(50)).subscribe(),
+            Arc::new(counter),
+            watch::Sender::new(PERIOD).subscribe(),
             out,
         ));
         let mut seen = Vec::new();
         while seen.len() < 4 {
+            permits.add_permits(1);
             watch_value.changed().await.unwrap();
             seen.push(watch_value.borrow_and_update().value.clone());
         }

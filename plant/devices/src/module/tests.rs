@@ -275,7 +275,7 @@ async fn parameters_are_written_applied_and_read_back() {
     assert!(
         outcome
             .message
-            .contains("Turns is from any to 100 in the module, and 700 was given"),
+            .contains("Turns is from 1 to 100 in the module, and 700 was given"),
         "{}",
         outcome.message
     );
