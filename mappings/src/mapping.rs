@@ -708,15 +708,16 @@ impl Variable {
         topics.chain(service)
     }
 
-    /// Returns whether its values may act where they arrive: they call a service, command a
-    /// movement, are confirmed, or have a reaction to the loss of their commander. Values whose
-    /// origin is the OPC UA side are commands too.
+    /// Returns whether its values may act where they arrive: they call a service, are written to
+    /// another server, command a movement, are confirmed, or have a reaction to the loss of their
+    /// commander. Values whose origin is the OPC UA side are commands too.
     #[must_use]
     pub fn is_command(&self) -> bool {
         let calls = self.service.as_deref();
         let calls = calls.is_some_and(|of| matches!(of.role, ServiceRole::Call { .. }));
         let moves = |binding: &Binding| Motion::of(&binding.message_type).is_some();
         calls
+            || self.to.is_some()
             || self.bindings.iter().any(moves)
             || self.loss.is_some()
             || self.confirmed_within.is_some()
@@ -829,6 +830,40 @@ mod tests {
             None,
             "space 40 lives in domain 0"
         );
+    }
+
+    #[test]
+    fn values_that_move_or_are_written_to_a_server_are_commands() {
+        let text = "namespaces: {2: urn:cell}
+spaces: [{id: 1}]
+servers: [{name: plc, endpoint: 'opc.tcp://192.168.0.10:4840'}]
+variables:
+  - node: ns=2;i=30
+    name: Robot.Ready
+    type: Boolean
+    origin: 1
+    ros: {topic: /robot/ready, type: std_msgs/Bool}
+  - node: ns=2;i=31
+    name: Robot.Done
+    type: Boolean
+    origin: 1
+    ros: {topic: /robot/done, type: std_msgs/Bool}
+    to: {server: plc, node: \"nsu=urn:plc;s=Press.RobotDone\"}
+  - node: ns=2;i=32
+    name: Robot.Velocity
+    origin: 1
+    ros: {topic: /cmd_vel, type: geometry_msgs/Twist}
+";
+        let checked = Mapping::from_yaml(text, "cell.yaml");
+        let mapping = checked.mapping.as_ref();
+        let mapping = mapping.unwrap_or_else(|| panic!("{}", checked.render(text)));
+        let of = |name: &str| {
+            let mut variables = mapping.variables().iter();
+            variables.find(|one| one.name == name).unwrap().is_command()
+        };
+        assert!(!of("Robot.Ready"));
+        assert!(of("Robot.Done"));
+        assert!(of("Robot.Velocity"));
     }
 
     #[test]

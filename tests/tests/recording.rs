@@ -147,6 +147,12 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
     let got = joints_there.wait_for_json("joints", SOON, |line| line.get("value").cloned());
     assert_eq!(got["position"], json!([0.5, -0.25]), "{got}");
     assert_eq!(commands_there.values(), Vec::<Value>::new());
+    let words = ["replay", text(&packets), "--commands", "--speed", "0.5"];
+    let (code, replayed) = ended(&words);
+    assert_eq!(code, 0, "{replayed}");
+    eventually("the commands of the replay are in ROS 2", SOON, || {
+        (!commands_there.values().is_empty()).then_some(())
+    });
 }
 
 #[test]

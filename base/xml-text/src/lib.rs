@@ -2,7 +2,8 @@
 //! mark, or else of the declaration, or else UTF-8.
 //!
 //! Engineering tools export UTF-16 and ISO-8859-1 as well as UTF-8. The parsers of the workspace
-//! read text only.
+//! read text only, and compare the attributes of an element pairwise, so that
+//! [`has_more_attributes`] limits their number.
 
 use std::borrow::Cow;
 
@@ -63,6 +64,54 @@ pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, EncodingError> {
             bytes.iter().map(|byte| windows(*byte)).collect(),
         )),
     }
+}
+
+/// Returns whether a tag of a document has more than `most` attributes, in linear time.
+///
+/// Parsers compare the attributes of an element pairwise. Declarations of namespaces count too.
+/// The document need not be well-formed.
+#[must_use]
+pub fn has_more_attributes(document: &str, most: usize) -> bool {
+    let mut rest = document;
+    while let Some((_, markup)) = rest.split_once('<') {
+        rest = match behind_other(markup) {
+            Some(behind) => behind,
+            None => {
+                let (count, behind) = attributes(markup);
+                if count > most {
+                    return true;
+                }
+                behind
+            }
+        };
+    }
+    false
+}
+
+/// Returns the text behind a comment, CDATA section or instruction. The markup begins after `<`.
+fn behind_other(markup: &str) -> Option<&str> {
+    let kinds = [("!--", "-->"), ("![CDATA[", "]]>"), ("?", "?>")];
+    kinds.into_iter().find_map(|(start, end)| {
+        let inside = markup.strip_prefix(start)?;
+        Some(inside.split_once(end).map_or("", |(_, behind)| behind))
+    })
+}
+
+/// Returns the number of attributes of a tag, and the text behind it. The tag begins after `<`.
+fn attributes(tag: &str) -> (usize, &str) {
+    let mut count = 0;
+    let mut quote = None;
+    for (at, byte) in tag.bytes().enumerate() {
+        match (quote, byte) {
+            (Some(open), _) if byte == open => quote = None,
+            (Some(_), _) => {}
+            (None, b'"' | b'\'') => quote = Some(byte),
+            (None, b'=') => count += 1,
+            (None, b'>') => return (count, tag.get(at + 1..).unwrap_or_default()),
+            (None, _) => {}
+        }
+    }
+    (count, "")
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -189,6 +238,32 @@ mod tests {
         }
         let euro = b"<?xml version='1.0' encoding='windows-1252'?><a>\x80\x9f</a>";
         assert!(decode(euro).unwrap().ends_with("<a>€Ÿ</a>"));
+    }
+
+    #[test]
+    fn attributes_are_counted_in_tags_only() {
+        for (document, count) in [
+            ("", 0),
+            ("<a/>", 0),
+            ("<a b='1'/>", 1),
+            (
+                "<?xml version='1.0'?><a b='1' xmlns:c = \"urn:c\">= = =</a>",
+                2,
+            ),
+            ("<a b='= > <' c=\"'=\"><d e='1'/></a>", 2),
+            ("<!-- <a b='' c='' d=''> ' --><a b=''/>", 1),
+            ("<a><![CDATA[<b c='' d=''>\"]]></a>", 0),
+            ("<a>it's<b c='ö' d='ü'>'</b></a>", 2),
+            // Unfinished markup.
+            ("<a b='1' c='", 2),
+            ("<a b='1'><!-- <a b='' c=''>", 1),
+            ("a<", 0),
+        ] {
+            assert!(!has_more_attributes(document, count), "{document}");
+            let fewer = count.checked_sub(1);
+            let is_more = fewer.is_none_or(|fewer| has_more_attributes(document, fewer));
+            assert!(is_more, "{document}");
+        }
     }
 
     #[test]

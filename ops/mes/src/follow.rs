@@ -67,8 +67,10 @@ async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
     };
     let mut again = AGAIN;
     loop {
+        let began = std::time::Instant::now();
         match once(&cell, &seen).await {
-            Ok(()) => again = AGAIN,
+            Ok(()) if began.elapsed() > AGAIN_AT_MOST => again = AGAIN,
+            Ok(()) => {}
             Err(fault) => debug!(url = seen.url, "a server does not tell its skills: {fault}"),
         }
         tokio::time::sleep(again).await;

@@ -244,7 +244,10 @@ async fn watch(
             _ = link.wait_for(is_down) => return,
         };
         let (watch, value) = match notice {
-            Some(Notice::Value { watch, value }) => (watch, value.value),
+            Some(Notice::Value { watch, value }) => {
+                let is_good = value.status.is_none_or(|status| status.is_good());
+                (watch, value.value.filter(|_| is_good))
+            }
             Some(Notice::Refused { watch, status }) => {
                 let service = of.get(watch).map(|(iri, _)| iri.as_str());
                 info!(service, %status, "the state of a service cannot be watched");

@@ -23,8 +23,9 @@ use opcua::server::node_manager::{
 use opcua::server::{CreateMonitoredItem, MonitoredItemHandle, SubscriptionCache};
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
-    AttributeId, DataEncoding, DataValue, DateTime, NodeId, NumericRange, ReadAtTimeDetails,
-    ReadProcessedDetails, ReadRawModifiedDetails, StatusCode, TimestampsToReturn, Variant,
+    AttributeId, DataEncoding, DataValue, DateTime, MonitoringMode, NodeId, NumericRange,
+    ReadAtTimeDetails, ReadProcessedDetails, ReadRawModifiedDetails, StatusCode,
+    TimestampsToReturn, Variant,
 };
 use plant_opcua::nodeset::NodeSets;
 use plant_opcua::server::Caller;
@@ -1011,9 +1012,15 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
                 item.set_status(status);
                 continue;
             }
+            let read = address_space.validate_node_read(context, node).map(drop);
+            // Later values would reach the client without another check.
+            if let Err(StatusCode::BadUserAccessDenied) = read {
+                item.set_status(StatusCode::BadUserAccessDenied);
+                continue;
+            }
             self.watched.lock().insert(handle, unfiltered, queue);
-            let value = match address_space.validate_node_read(context, node) {
-                Ok(_) => {
+            let value = match read {
+                Ok(()) => {
                     let answer = self.answer_item(&node.node_id, handle);
                     answer.or_else(|| self.exits.alarms.read(&node.node_id))
                 }
@@ -1047,6 +1054,28 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         for item in items {
             let queue = usize::try_from(item.update().revised_queue_size);
             watched.resize(item.handle(), queue.unwrap_or(usize::MAX));
+        }
+    }
+
+    /// Reports the present values of items that are no longer disabled. The library reports no
+    /// value twice, so items that were enabled before are not disturbed.
+    async fn set_monitoring_mode(
+        &self,
+        context: &RequestContext,
+        mode: MonitoringMode,
+        items: &[&MonitoredItemRef],
+    ) {
+        if mode == MonitoringMode::Disabled {
+            return;
+        }
+        let access = &self.exits.access;
+        for item in items {
+            let node = item.node_id();
+            let may = access.allows(&context.token, node, Right::Read);
+            // An item of events gets no values.
+            if may && item.attribute() == AttributeId::Value {
+                self.look_at(&context.subscriptions, node, item.handle());
+            }
         }
     }
 

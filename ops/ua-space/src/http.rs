@@ -143,6 +143,7 @@ impl Server {
         let stream = TcpStream::connect(&self.authority)
             .await
             .map_err(|error| format!("nobody listens there ({error})"))?;
+        let is_protobuf = content_type == PROTOBUF;
         let text = |error: hyper::Error| error.to_string();
         let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
             .await
@@ -171,7 +172,12 @@ impl Server {
                 .collect()
                 .await;
             let body = body.map_err(|error| error.to_string())?.to_bytes();
-            let body = String::from_utf8(body.into()).map_err(|_| "an answer that is no text")?;
+            let body = match String::from_utf8(body.into()) {
+                Ok(body) => body,
+                // A collector of OTLP answers in protobuf, too. The texts in it are legible.
+                Err(wrong) if is_protobuf => String::from_utf8_lossy(wrong.as_bytes()).into_owned(),
+                Err(_) => return Err("an answer that is no text".to_owned()),
+            };
             Ok(Answer {
                 status,
                 content_type,
@@ -216,6 +222,8 @@ pub(crate) fn encoded(value: &str) -> String {
 /// Plain JSON, which is accepted even where the server also offers the SPARQL results format.
 const JSON: &str = "application/json";
 const RESULTS: &str = "application/sparql-results+json, application/n-triples";
+/// The content of a request whose answer need not be text.
+const PROTOBUF: &str = "application/x-protobuf";
 /// The time limit of a request, longer than the time limit of a query.
 const LIMIT: Duration = Duration::from_secs(15);
 /// The time limit of a change, which may be large.

@@ -38,7 +38,7 @@ pub(crate) struct Asked<'a> {
 /// A request without a usable response.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Fault {
-    /// There is no connection: the request was not sent.
+    /// The request was not sent: there is no connection, or Halt came before.
     Unreachable(String),
     /// The request was sent, and the response is missing or damaged.
     Lost(String),
@@ -67,6 +67,19 @@ impl Host {
     /// # Errors
     /// A [`Fault`], which says whether the request may have been executed.
     pub(crate) async fn ask(&self, asked: Asked<'_>) -> Result<Value, Fault> {
+        self.ask_unless(asked, || false).await
+    }
+
+    /// As [`ask`](Self::ask). The request is not sent if it is withdrawn when the connection has
+    /// been made.
+    ///
+    /// # Errors
+    /// As [`ask`](Self::ask); [`Fault::Unreachable`] for a withdrawn request.
+    pub(crate) async fn ask_unless(
+        &self,
+        asked: Asked<'_>,
+        withdrawn: impl Fn() -> bool + Send,
+    ) -> Result<Value, Fault> {
         let until = Instant::now() + asked.within;
         let late = || {
             let within = asked.within.as_millis();
@@ -99,6 +112,10 @@ impl Host {
             .map_err(|error| {
                 Fault::Unreachable(format!("{} cannot be asked for: {error}", asked.path))
             })?;
+        if withdrawn() {
+            let why = "Halt came before the request was sent".to_owned();
+            return Err(Fault::Unreachable(why));
+        }
         let answering = async {
             let answer = send.send_request(request).await;
             self.read(answer.map_err(|error| self.damaged(&error))?)

@@ -61,6 +61,44 @@ struct Poll {
     reason: Option<String>,
 }
 
+impl Poll {
+    /// Returns the reason of the failure that a response reports, if any.
+    fn failure(&self, answer: &Json) -> Option<String> {
+        if !self.failed.as_ref()?.holds(answer) {
+            return None;
+        }
+        let why = text_at(self.reason.as_ref(), answer).filter(|why| !why.is_empty());
+        let why = why.unwrap_or_else(|| "the device reports a failure".to_owned());
+        Some(why.chars().take(LONGEST_REASON).collect())
+    }
+
+    /// Returns the progress in a response, from 0 to 1.
+    fn progress(&self, answer: &Json) -> Option<f32> {
+        let progress = answer.pointer(self.progress.as_ref()?)?.as_f64()?;
+        #[expect(clippy::cast_possible_truncation, reason = "a fraction from 0 to 1")]
+        let progress = progress.clamp(0.0, 1.0) as f32;
+        Some(progress)
+    }
+
+    /// Reports the progress and the step in a response. `step` is the last reported step.
+    async fn report(&self, answer: &Json, work: &Work, step: &mut Option<String>) {
+        if let Some(progress) = self.progress(answer) {
+            work.progress(progress);
+        }
+        let now = text_at(self.step.as_ref(), answer);
+        if now.is_some() && now != *step {
+            let shown: String = now.iter().flat_map(|now| now.chars()).take(80).collect();
+            work.step(shown).await;
+            *step = now;
+        }
+    }
+}
+
+/// Returns the value at a JSON pointer as text.
+fn text_at(pointer: Option<&String>, answer: &Json) -> Option<String> {
+    answer.pointer(pointer?).map(plain)
+}
+
 /// The driver of a skill.
 #[derive(Debug, PartialEq)]
 struct HttpSkill {
@@ -89,7 +127,8 @@ impl Driver for HttpSkill {
     }
 
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
-        let all = [Some(&self.start), self.poll.as_ref().map(|of| &of.request)];
+        let poll = self.poll.as_ref().map(|of| &of.request);
+        let all = [Some(&self.start), poll, self.stop.as_ref()];
         for template in all.into_iter().flatten() {
             template.filled(parameters)?;
         }
@@ -98,27 +137,32 @@ impl Driver for HttpSkill {
 
     async fn run(&self, work: Work) -> Result<Results, String> {
         work.step("Start").await;
-        let ended = self.work(&work).await;
-        match ended {
-            Ended::Done(answer) => self.outcome(&answer),
-            Ended::Failed(why) => Err(why),
-            Ended::Unknown(why) => {
-                let stopped = match self.stop(work.parameters()).await {
-                    None => "there is no `stop` request".to_owned(),
-                    Some(Ok(())) => "the `stop` request is done".to_owned(),
-                    Some(Err(fault)) => format!("the `stop` request has failed: {fault}"),
-                };
-                let why = format!("{why}; {stopped}");
-                work.unknown(&why).await;
-                Err(why)
-            }
-        }
+        let unknown = match self.work(&work).await {
+            // The state of the machine is unknown without its results.
+            Ended::Done(answer) => match self.outcome(&answer) {
+                Ok(results) => return Ok(results),
+                Err(why) => why,
+            },
+            Ended::Failed(why) => return Err(why),
+            Ended::Unknown(why) => why,
+        };
+        let stopped = match self.stop(work.parameters()).await {
+            None => "there is no `stop` request".to_owned(),
+            Some(Ok(())) => "the `stop` request is done".to_owned(),
+            Some(Err(fault)) => format!("the `stop` request has failed: {fault}"),
+        };
+        let why = format!("{unknown}; {stopped}");
+        work.unknown(&why).await;
+        Err(why)
     }
 }
 
 impl HttpSkill {
     async fn work(&self, work: &Work) -> Ended {
-        let starting = self.start.send(work.parameters(), self.within);
+        let is_stopped = || work.is_stopped();
+        let starting = self
+            .start
+            .send_unless(work.parameters(), self.within, is_stopped);
         tokio::pin!(starting);
         let started = tokio::select! {
             started = &mut starting => started,
@@ -158,14 +202,8 @@ impl HttpSkill {
                 () = sleep(poll.every) => {}
                 () = work.stopped(), if until.is_none() => {
                     until = Some(Instant::now() + self.halt_timeout);
-                    work.pending("the device is asked to stop").await;
-                    match self.stop(work.parameters()).await {
-                        Some(Ok(())) => {}
-                        Some(Err(fault)) => return Ended::Unknown(fault.to_string()),
-                        None => {
-                            let why = "the YAML has no `stop` request: the work goes on";
-                            work.cancel_refused(why).await;
-                        }
+                    if let Err(fault) = self.halt(work).await {
+                        return Ended::Unknown(fault.to_string());
                     }
                 }
                 () = at(until) => {
@@ -173,7 +211,14 @@ impl HttpSkill {
                     return Ended::Unknown(format!("the work has not ended within {limit:?} after Halt"));
                 }
             }
-            let answer = match poll.request.send(work.parameters(), self.within).await {
+            let within = self.within.min(LONGEST_SILENCE);
+            // A slow response does not delay the stop.
+            let asked = tokio::select! {
+                asked = poll.request.send(work.parameters(), within) => asked,
+                () = work.stopped(), if until.is_none() => continue,
+                () = at(until) => continue,
+            };
+            let answer = match asked {
                 Ok(answer) => answer,
                 Err(fault) if answered.elapsed() > LONGEST_SILENCE => {
                     return Ended::Unknown(format!("the state is unknown: {fault}"));
@@ -181,32 +226,25 @@ impl HttpSkill {
                 Err(_) => continue,
             };
             answered = Instant::now();
-            let text = |pointer: &Option<String>| {
-                let found = answer.pointer(pointer.as_ref()?)?;
-                let text = found.as_str();
-                Some(text.map_or_else(|| found.to_string(), str::to_owned))
-            };
             if poll.done.holds(&answer) {
                 return Ended::Done(answer);
             }
-            if poll.failed.as_ref().is_some_and(|of| of.holds(&answer)) {
-                let why = text(&poll.reason).filter(|why| !why.is_empty());
-                let why = why.unwrap_or_else(|| "the device reports a failure".to_owned());
-                return Ended::Failed(why.chars().take(LONGEST_REASON).collect());
+            if let Some(why) = poll.failure(&answer) {
+                return Ended::Failed(why);
             }
-            let progress = poll.progress.as_ref();
-            let progress = progress.and_then(|pointer| answer.pointer(pointer)?.as_f64());
-            if let Some(progress) = progress {
-                #[expect(clippy::cast_possible_truncation, reason = "a fraction from 0 to 1")]
-                work.progress(progress.clamp(0.0, 1.0) as f32);
-            }
-            let now = text(&poll.step);
-            if now.is_some() && now != step {
-                let shown: String = now.iter().flat_map(|now| now.chars()).take(80).collect();
-                work.step(shown).await;
-                step = now;
-            }
+            poll.report(&answer, work, &mut step).await;
         }
+    }
+
+    /// Asks the device to stop on Halt.
+    async fn halt(&self, work: &Work) -> Result<(), Fault> {
+        work.pending("the device is asked to stop").await;
+        let Some(stopped) = self.stop(work.parameters()).await else {
+            let why = "the YAML has no `stop` request: the work goes on";
+            work.cancel_refused(why).await;
+            return Ok(());
+        };
+        stopped
     }
 
     /// Sends the `stop` request; `None` if there is none.
@@ -236,6 +274,16 @@ async fn at(until: Option<Instant>) {
 
 impl Template {
     async fn send(&self, parameters: &Parameters, within: Duration) -> Result<Json, Fault> {
+        self.send_unless(parameters, within, || false).await
+    }
+
+    /// Sends the request, unless it is withdrawn before.
+    async fn send_unless(
+        &self,
+        parameters: &Parameters,
+        within: Duration,
+        withdrawn: impl Fn() -> bool + Send,
+    ) -> Result<Json, Fault> {
         let (path, body) = self.filled(parameters).map_err(Fault::Unreachable)?;
         let asked = Asked {
             method: &self.method,
@@ -243,7 +291,7 @@ impl Template {
             body: body.as_ref(),
             within,
         };
-        self.host.ask(asked).await
+        self.host.ask_unless(asked, withdrawn).await
     }
 
     /// Returns the path and the body with the values of parameters.

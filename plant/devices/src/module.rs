@@ -187,7 +187,7 @@ impl Device for ProcessModule {
             ),
             parameters: self.parameters(skill).collect(),
             outputs: procedure::outputs(&skill.service, &skill.procedure).collect(),
-            is_self_completing: skill.procedure.is_self_completing,
+            has_run_time: procedure::has_run_time(&skill.procedure, self.parameters(skill)),
         });
         let skills: Vec<_> = skills.collect();
         let namespace = self.namespace();
@@ -343,9 +343,13 @@ fn read_capabilities(
 /// Returns whether a value was read as it was written; a Float of a module has fewer digits.
 fn is_equal(written: &Value, read: &Value) -> bool {
     match (written.as_f64(), read.as_f64()) {
-        (Some(written), Some(read)) => {
-            let scale = written.abs().max(read.abs()).max(1.0);
-            (written - read).abs() <= scale * 1e-6
+        (Some(a), Some(b)) => {
+            let is_float = |value: &Value| matches!(value, Value::Float(_) | Value::Double(_));
+            let most = match is_float(written) || is_float(read) {
+                true => a.abs().max(b.abs()) * 1e-6,
+                false => 0.0,
+            };
+            (a - b).abs() <= most
         }
         _ => written == read,
     }

@@ -22,7 +22,7 @@ use skills::{
 };
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
-use tokio::time::{Instant, timeout};
+use tokio::time::{Instant, sleep, timeout};
 
 use self::force::Guard;
 pub use self::pose::{of_robot, to_robot};
@@ -371,6 +371,22 @@ impl Motion {
         }
         Ok(stream)
     }
+
+    /// Stops a robot that moves and whose state is not received. Returns the reason with what was
+    /// done.
+    async fn lost(&self, work: &Work, why: &str) -> String {
+        let stopped = match self.send(HALT).await {
+            Ok(program) => {
+                sleep(SETTLED).await;
+                drop(program);
+                "the stop program is sent".to_owned()
+            }
+            Err(why) => format!("the stop program is not sent: {why}"),
+        };
+        let why = format!("{why}; the outcome is unknown, {stopped}");
+        work.unknown(&why).await;
+        why
+    }
 }
 
 /// The RTDE connection of a run.
@@ -404,7 +420,10 @@ impl Session {
         let asked = Instant::now();
         let mut standing = None;
         loop {
-            let at = self.state().await?;
+            let at = match self.state().await {
+                Ok(at) => at,
+                Err(why) => return Err(motion.lost(work, &why).await),
+            };
             if at.done == token {
                 return Ok(at);
             }
@@ -412,8 +431,8 @@ impl Session {
             if let Some(guard) = guard
                 && guard.exceeded(at.force, at.pose)
             {
-                work.note(guard.to_string()).await;
-                return self.brake(motion, standing).await;
+                let force = guard.to_string();
+                return self.contact((motion, work), standing, &force).await;
             }
             if at.started == token && !at.program {
                 return Err("the program of the robot has ended before its move: another one took its place".to_owned());
@@ -443,6 +462,26 @@ impl Session {
         }
     }
 
+    /// Brakes at the force limit, and returns the state of the robot after that.
+    ///
+    /// # Errors
+    /// The robot has not stopped: the outcome is unknown.
+    async fn contact(
+        &mut self,
+        (motion, work): (&Motion, &Work),
+        slider: Option<f64>,
+        force: &str,
+    ) -> Result<State, String> {
+        let at = self.brake(motion, slider).await?;
+        work.note(force).await;
+        if at.speed < STILL {
+            return Ok(at);
+        }
+        let why = format!("{force}, and the robot has not stopped: the outcome is unknown");
+        work.unknown(&why).await;
+        Err(why)
+    }
+
     /// Brakes, and returns the position of the robot after that as text.
     async fn halt(&mut self, motion: &Motion, slider: Option<f64>) -> Result<String, String> {
         let [x, y, z, ..] = self.brake(motion, slider).await?.pose;
@@ -451,7 +490,7 @@ impl Session {
 
     /// Brakes, and returns the state of the robot after that.
     async fn brake(&mut self, motion: &Motion, slider: Option<f64>) -> Result<State, String> {
-        let _program = motion.send("def ua_halt():\n  stopl(3.0)\nend\n").await?;
+        let _program = motion.send(HALT).await?;
         let asked = Instant::now();
         let at = loop {
             let at = self.state().await?;
@@ -503,6 +542,8 @@ async fn is(ready: impl Future<Output = ()>) -> bool {
     }
 }
 
+/// The program that stops the robot along its path.
+const HALT: &str = "def ua_halt():\n  stopl(3.0)\nend\n";
 /// `runtime_state` of a running program.
 const PLAYING: u32 = 2;
 const HERTZ: f64 = 50.0;

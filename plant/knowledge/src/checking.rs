@@ -1,6 +1,8 @@
 //! The report of the shapes over HTTP.
 
+use std::io;
 use std::net::IpAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -15,6 +17,7 @@ use crate::http::{Refusal, Site, content, json_page};
 use crate::lanes::Lane;
 use crate::query::{Asked, Dataset, Formats, QueryFault, Results};
 use crate::shapes::{Check, Report, Shapes, Violation};
+use crate::store::Knowledge;
 
 impl Site {
     /// Checks the knowledge against the shapes. The report is Turtle, or JSON if that is accepted.
@@ -25,15 +28,21 @@ impl Site {
     ) -> Result<Response<Full<Bytes>>, Refusal> {
         let failed =
             |what: String| Refusal::new(StatusCode::INTERNAL_SERVER_ERROR, "failed", &what);
-        let shapes = Shapes::of(self.queries.knowledge());
-        let shapes = shapes.map_err(|fault| failed(fault.to_string()))?;
-        let (checks, unchecked) = shapes.checks();
+        let knowledge = Arc::clone(self.queries.knowledge());
+        let reading = tokio::task::spawn_blocking(move || compiled(&knowledge));
+        let read = reading.await.map_err(|error| failed(error.to_string()))?;
+        let (shapes, checks, unchecked) = read.map_err(failed)?;
         let mut report = Report {
             unchecked,
             ..Report::default()
         };
         let end = Instant::now() + TIME;
+        let mut size = 0;
         for check in checks {
+            if Instant::now() >= end || size > MAX_SIZE {
+                report.not_checked(&check, "the time or the size of the report is over");
+                continue;
+            }
             let asked = Asked::Sparql(
                 check.query.clone(),
                 Dataset::default(),
@@ -45,7 +54,9 @@ impl Site {
             let running = self.queries.run(asked, Lane::Open(peer));
             match tokio::time::timeout_at(end, running).await {
                 Ok(Ok(Results::Written(_, rows))) => {
+                    size += rows.len();
                     let rows = rows_of(&rows).map_err(failed)?;
+                    size += rows.len() * size_of_each(&check);
                     report
                         .violations
                         .extend(rows.into_iter().filter_map(|row| violation(&check, row)));
@@ -56,15 +67,34 @@ impl Site {
                 Err(_) => report.not_checked(&check, "the time of the report is over"),
             }
         }
-        match is_json {
-            true => Ok(json_page(&report.json())),
-            false => {
-                let turtle = report.turtle(&shapes);
-                let turtle = turtle.map_err(|error| failed(error.to_string()))?;
-                Ok(content("text/turtle", turtle))
-            }
-        }
+        let writing = tokio::task::spawn_blocking(move || page(&report, &shapes, is_json));
+        let written = writing.await.map_err(|error| failed(error.to_string()))?;
+        written.map_err(|error| failed(error.to_string()))
     }
+}
+
+/// The shapes, their checks, and their parts that are not checked.
+type Compiled = (Shapes, Vec<Check>, Vec<String>);
+
+/// Reads and compiles the shapes, which takes long for many of them.
+fn compiled(knowledge: &Knowledge) -> Result<Compiled, String> {
+    let shapes = Shapes::of(knowledge).map_err(|fault| fault.to_string())?;
+    let (checks, unchecked) = shapes.checks();
+    Ok((shapes, checks, unchecked))
+}
+
+/// Writes a report, which takes long for many violations.
+fn page(report: &Report, shapes: &Shapes, is_json: bool) -> io::Result<Response<Full<Bytes>>> {
+    match is_json {
+        true => Ok(json_page(&report.json())),
+        false => Ok(content("text/turtle", report.turtle(shapes)?)),
+    }
+}
+
+/// Returns the bytes of the texts that each violation of a constraint repeats.
+fn size_of_each(check: &Check) -> usize {
+    let path = check.path.as_ref().map_or(0, |(_, path)| path.len());
+    check.shape.to_string().len() + check.message.len() + path
 }
 
 impl Report {
@@ -141,3 +171,5 @@ fn term(found: Found) -> Term {
 
 /// Time limit of a report, below that of clients.
 const TIME: Duration = Duration::from_secs(10);
+/// Maximum size of the collected results in bytes. The last constraint may exceed it.
+const MAX_SIZE: usize = 32 << 20;

@@ -6,7 +6,7 @@
 mod compile;
 mod report;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use oxigraph::io::{RdfFormat, RdfParser};
 use oxigraph::model::{GraphNameRef, NamedNodeRef, NamedOrBlankNode, Term, Triple};
@@ -22,6 +22,8 @@ pub(crate) struct Shapes {
     by_subject: HashMap<NamedOrBlankNode, Vec<(String, Term)>>,
     /// The subjects in the order of their statements.
     subjects: Vec<NamedOrBlankNode>,
+    /// All statements, each once.
+    known: HashSet<Triple>,
 }
 
 impl Shapes {
@@ -47,14 +49,14 @@ impl Shapes {
     }
 
     fn add(&mut self, triple: Triple) {
+        if !self.known.insert(triple.clone()) {
+            return;
+        }
         let about = self.by_subject.entry(triple.subject.clone()).or_default();
         if about.is_empty() {
             self.subjects.push(triple.subject);
         }
-        let statement = (triple.predicate.into_string(), triple.object);
-        if !about.contains(&statement) {
-            about.push(statement);
-        }
+        about.push((triple.predicate.into_string(), triple.object));
     }
 
     fn about(&self, subject: &NamedOrBlankNode) -> &[(String, Term)] {

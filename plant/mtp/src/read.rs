@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 
-use crate::caex::{Element, ManifestError};
+use crate::caex::{Element, MAX_FILE, ManifestError};
 use crate::container;
 use crate::elements;
 use crate::model::{
@@ -38,6 +38,7 @@ impl Module {
         };
         let mut root = Element::read(&xml_text::decode(&unpacked)?)?;
         let mut missing = Vec::new();
+        let mut total = unpacked.len();
         for (reference, line) in references(&root) {
             let document = match is_container {
                 true => container::named(file, &reference)?,
@@ -47,6 +48,16 @@ impl Module {
                 missing.push((reference, line));
                 continue;
             };
+            if document.as_slice() == &*unpacked {
+                continue;
+            }
+            total = total.saturating_add(document.len());
+            if total > MAX_FILE {
+                return Err(ManifestError::TooLarge {
+                    length: total,
+                    most: MAX_FILE,
+                });
+            }
             let part = Element::read(&xml_text::decode(&document)?)?;
             root.children.extend(part.children);
         }

@@ -65,6 +65,7 @@ impl Folder {
 impl Files for Folder {
     fn read(&mut self, name: &str) -> Result<Vec<u8>, String> {
         if let Some(given) = self.given.get(name) {
+            check_size(u64::try_from(given.len()).unwrap_or(u64::MAX))?;
             return Ok(given.clone());
         }
         let path = self.path(name)?;
@@ -73,16 +74,20 @@ impl Files for Folder {
         if !metadata.is_file() {
             return Err(format!("{} is no file", path.display()));
         }
-        if metadata.len() > MAX_FILE {
-            return Err(format!(
-                "it has {} bytes, more than the {MAX_FILE} that are read",
-                metadata.len()
-            ));
-        }
+        check_size(metadata.len())?;
         let mut bytes = Vec::new();
         let mut file = File::open(&path).map_err(cannot)?.take(MAX_FILE);
         file.read_to_end(&mut bytes).map_err(cannot)?;
         Ok(bytes)
+    }
+}
+
+fn check_size(bytes: u64) -> Result<(), String> {
+    match bytes > MAX_FILE {
+        true => Err(format!(
+            "it has {bytes} bytes, more than the {MAX_FILE} that are read"
+        )),
+        false => Ok(()),
     }
 }
 

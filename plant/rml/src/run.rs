@@ -97,6 +97,11 @@ impl Mapping {
                     "the files of the mapping have more than {MAX_FILES} bytes together"
                 )));
             }
+            // The parser compares the attributes of an element pairwise.
+            if xml_text::has_more_attributes(&text, MAX_ATTRIBUTES) {
+                let what = format!("an element has more than {MAX_ATTRIBUTES} attributes");
+                return Err(self.file_fault(file, what));
+            }
             texts.push((file, text.into_owned()));
         }
         Ok(texts)
@@ -143,6 +148,8 @@ type RowIndex = HashMap<Vec<String>, Vec<usize>>;
 struct Sink {
     quads: Vec<Quad>,
     known: HashSet<Quad>,
+    /// The bytes of the terms of all statements.
+    bytes: usize,
 }
 
 impl Sink {
@@ -153,6 +160,12 @@ impl Sink {
             ));
         }
         if self.known.insert(quad.clone()) {
+            self.bytes = self.bytes.saturating_add(bytes_of(&quad));
+            if self.bytes > MAX_BYTES {
+                return Err(format!(
+                    "the statements have more than {MAX_BYTES} bytes; shorten the subjects"
+                ));
+            }
             self.quads.push(quad);
         }
         Ok(())
@@ -271,6 +284,7 @@ impl<'a> Run<'a> {
         let default = graphs.is_empty().then_some(GraphName::DefaultGraph);
         let named = graphs.iter().map(|key| key.graph.clone());
         for graph in default.into_iter().chain(named) {
+            self.work.spend(1)?;
             self.sink.add(Quad::new(
                 subject.clone(),
                 predicate.clone(),
@@ -328,8 +342,11 @@ impl<'a> Run<'a> {
         let mut seen = HashSet::new();
         for key in self.keys(children, row)? {
             for at in index.get(&key).into_iter().flatten() {
+                self.work.spend(1)?;
                 if seen.insert(*at) {
-                    terms.extend(subjects.get(*at).into_iter().flatten().cloned());
+                    let found = subjects.get(*at).map_or(&[][..], Vec::as_slice);
+                    self.work.spend(found.len())?;
+                    terms.extend_from_slice(found);
                 }
             }
         }
@@ -381,9 +398,11 @@ impl<'a> Run<'a> {
         expressions: impl Iterator<Item = &'e Expression>,
         row: Row<'_>,
     ) -> Result<Vec<Vec<String>>, String> {
-        let mut keys = vec![Vec::new()];
+        let mut keys: Vec<Vec<String>> = vec![Vec::new()];
         for expression in expressions {
             let values = self.expand(expression, row, TermKind::Literal)?;
+            let bytes: usize = keys.iter().flatten().map(String::len).sum();
+            self.work.spend(product(keys.len(), bytes, &values))?;
             keys = combined(&keys, &values, |key, value| {
                 let mut key = key.clone();
                 key.push(value.clone());
@@ -496,9 +515,9 @@ impl<'a> Run<'a> {
                     values
                 }
             };
+            let bytes: usize = texts.iter().map(String::len).sum();
+            self.work.spend(product(texts.len(), bytes, &values))?;
             texts = combined(&texts, &values, |text, value| format!("{text}{value}"))?;
-            let length = texts.iter().map(String::len).sum();
-            self.work.spend(length)?;
         }
         Ok(texts)
     }
@@ -539,6 +558,41 @@ impl Ord for GraphKey {
     fn cmp(&self, other: &Self) -> std::cmp::Ordering {
         self.key.cmp(&other.key)
     }
+}
+
+/// Returns the work of combining `count` texts, which have `bytes` together, with values: the
+/// number of the combinations, and their bytes.
+fn product(count: usize, bytes: usize, values: &[String]) -> usize {
+    let of_values: usize = values.iter().map(String::len).sum();
+    count
+        .saturating_mul(values.len())
+        .saturating_add(bytes.saturating_mul(values.len()))
+        .saturating_add(of_values.saturating_mul(count))
+}
+
+/// Returns the bytes of the terms of a statement.
+fn bytes_of(quad: &Quad) -> usize {
+    let subject = match &quad.subject {
+        NamedOrBlankNode::NamedNode(node) => node.as_str().len(),
+        NamedOrBlankNode::BlankNode(node) => node.as_str().len(),
+    };
+    let object = match &quad.object {
+        Term::NamedNode(node) => node.as_str().len(),
+        Term::BlankNode(node) => node.as_str().len(),
+        Term::Literal(literal) => {
+            let of_type = match literal.language() {
+                Some(language) => language.len(),
+                None => literal.datatype().as_str().len(),
+            };
+            literal.value().len() + of_type
+        }
+    };
+    let graph = match &quad.graph_name {
+        GraphName::NamedNode(node) => node.as_str().len(),
+        GraphName::BlankNode(node) => node.as_str().len(),
+        GraphName::DefaultGraph => 0,
+    };
+    subject + quad.predicate.as_str().len() + object + graph
 }
 
 fn combined<T>(
@@ -624,7 +678,11 @@ fn xml_fault(fault: &roxmltree::Error) -> String {
 const MAX_WORK: u64 = 500_000_000;
 const MAX_NODES: u32 = 8_000_000;
 const MAX_FILES: usize = 256 << 20;
+/// Maximum number of attributes of an element.
+const MAX_ATTRIBUTES: usize = 1000;
 const MAX_STATEMENTS: usize = 2_000_000;
+/// Maximum number of bytes of the terms of all statements.
+const MAX_BYTES: usize = 512 << 20;
 const MAX_COMBINATIONS: usize = 100_000;
 const MAX_FINDINGS: usize = 100;
 const MAX_SHOWN: usize = 80;
@@ -640,6 +698,25 @@ mod tests {
             let (open, close) = ("<a>".repeat(300), "</a>".repeat(300));
             Ok(format!("{open}{close}").into_bytes())
         }
+    }
+
+    #[test]
+    fn the_work_of_combinations_is_their_number_and_their_bytes() {
+        let values = ["ab".to_owned(), String::new()];
+        assert_eq!(product(3, 10, &values), 3 * 2 + 10 * 2 + 2 * 3);
+        assert_eq!(product(1, usize::MAX, &values), usize::MAX);
+        assert_eq!(product(3, 10, &[]), 0);
+    }
+
+    #[test]
+    fn the_bytes_of_a_statement_are_those_of_its_terms() {
+        let node = |iri: &str| NamedNode::new(iri).unwrap();
+        let graph = GraphName::DefaultGraph;
+        let named = Quad::new(node("urn:s"), node("urn:pp"), node("urn:ooo"), graph);
+        assert_eq!(bytes_of(&named), 5 + 6 + 7);
+        let text = Literal::new_language_tagged_literal("four", "de").unwrap();
+        let literal = Quad::new(node("urn:s"), node("urn:pp"), text, node("urn:g"));
+        assert_eq!(bytes_of(&literal), 5 + 6 + 4 + 2 + 5);
     }
 
     /// The reference visits 300^3 nodes for each of 300 rows.

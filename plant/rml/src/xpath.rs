@@ -9,6 +9,7 @@ mod functions;
 mod parse;
 mod tokens;
 
+use std::fmt;
 use std::sync::Arc;
 
 pub(crate) use evaluate::{Evaluator, NodeRef, Work};
@@ -69,7 +70,7 @@ pub(crate) enum Start {
 }
 
 /// The leading steps of an absolute path whose nodes do not depend on the row.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Clone)]
 pub(crate) struct Index {
     /// Identifies the steps within a document.
     pub(crate) key: Arc<str>,
@@ -79,17 +80,33 @@ pub(crate) struct Index {
     pub(crate) join: Option<Box<Join>>,
 }
 
+// An index follows from the steps of its path, which are shown and compared beside it.
+impl fmt::Debug for Index {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Index")
+    }
+}
+
+impl PartialEq for Index {
+    fn eq(&self, other: &Self) -> bool {
+        self.key == other.key
+    }
+}
+
 /// A step whose nodes are found by a value.
-#[derive(Debug, Clone, PartialEq)]
+///
+/// The expressions are shared: a path inside of them has an index too, which would double with each
+/// level of nesting.
+#[derive(Clone)]
 pub(crate) struct Join {
     /// Identifies the index within a document.
     pub(crate) key: Arc<str>,
     /// The values of a candidate.
-    pub(crate) candidate: Expr,
+    pub(crate) candidate: Arc<Expr>,
     /// The values that are looked up.
-    pub(crate) probe: Expr,
+    pub(crate) probe: Arc<Expr>,
     /// All other predicates of the step.
-    pub(crate) rest: Vec<Expr>,
+    pub(crate) rest: Arc<[Expr]>,
 }
 
 #[derive(Debug, Clone, PartialEq)]

@@ -191,6 +191,10 @@ fn a_file_with_an_error_is_named_with_its_line() {
         let fault = run(&text, xml).unwrap_err().to_string();
         assert!(fault.contains(part), "{fault:?} contains {part:?}");
     }
+    let attributes: String = (0..1001).map(|number| format!(" a{number}='1'")).collect();
+    let fault = run(&text, &format!("<a{attributes}/>")).unwrap_err();
+    let fault = fault.to_string();
+    assert!(fault.contains("more than 1000 attributes"), "{fault}");
 }
 
 #[test]
@@ -271,6 +275,9 @@ fn a_mapping_reads_files_of_its_folder_only() {
     }
     let mut given = files.with("plant", fs::read(&absolute).unwrap());
     assert_eq!(read("plant", &mut given).unwrap().quads.len(), 1);
+    let mut large = given.with("plant", vec![0; (64 << 20) + 1]);
+    let fault = read("plant", &mut large).unwrap_err().to_string();
+    assert!(fault.contains("more than the 67108864"), "{fault}");
 }
 
 /// An empty folder, which is removed at the end.

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -66,6 +66,8 @@ pub struct Configuration {
     fields: Arc<Vec<Configurable>>,
     values: watch::Sender<Arc<Values>>,
     store: Option<Arc<PathBuf>>,
+    /// Held while values are set, so that no change is lost.
+    setting: Arc<Mutex<()>>,
 }
 
 impl Default for Configuration {
@@ -83,6 +85,7 @@ impl Configuration {
             fields: Arc::new(fields),
             values: watch::Sender::new(Arc::default()),
             store: store.map(|path| Arc::new(path.to_owned())),
+            setting: Arc::default(),
         };
         let stored = store.filter(|_| !configuration.fields.is_empty());
         match stored.map(read) {
@@ -108,8 +111,7 @@ impl Configuration {
     /// Returns the value of a field: as configured, or its default.
     #[must_use]
     pub fn value(&self, field: &Configurable) -> Option<Value> {
-        let configured = self.values.borrow().get(&field.facts.name).cloned();
-        configured.or_else(|| field.default.clone())
+        field.value_in(&self.values.borrow())
     }
 
     /// Sets some fields; other fields keep their values. Nothing is set if one of them is wrong or
@@ -118,6 +120,7 @@ impl Configuration {
     /// # Errors
     /// The first wrong field, with the reason.
     pub fn set(&self, given: Vec<(String, Value)>) -> Result<(), NotConfigured> {
+        let _setting = self.setting.lock().unwrap_or_else(PoisonError::into_inner);
         let mut values = Values::clone(&self.values.borrow());
         let mut seen: Vec<String> = Vec::new();
         for (name, value) in given {
@@ -171,13 +174,13 @@ impl Configuration {
         self.values.send_replace(Arc::new(values));
     }
 
-    /// Returns the fields that act on a skill, with their values.
-    fn of_skill<'c>(
-        &'c self,
-        skill: &'c str,
-    ) -> impl Iterator<Item = (&'c Configurable, Value)> + 'c {
-        let acting = self.fields.iter().filter(move |field| field.acts_on(skill));
-        acting.filter_map(|field| Some((field, self.value(field)?)))
+    /// Returns the fields that act on a skill, with their values at one time.
+    fn of_skill(&self, skill: &str) -> Vec<(&Configurable, Value)> {
+        let values = Arc::clone(&self.values.borrow());
+        let acting = self.fields.iter().filter(|field| field.acts_on(skill));
+        acting
+            .filter_map(|field| Some((field, field.value_in(&values)?)))
+            .collect()
     }
 
     /// Returns the configured period of the measurements of values with these names.
@@ -226,6 +229,12 @@ impl Configurable {
             Some(near) => finding.with_help(format!("did you mean `{near}`?")),
             None => finding,
         })
+    }
+
+    /// Returns the value of the field among configured values, or its default.
+    fn value_in(&self, values: &Values) -> Option<Value> {
+        let configured = values.get(&self.facts.name).cloned();
+        configured.or_else(|| self.default.clone())
     }
 
     fn acts_on(&self, skill: &str) -> bool {
@@ -306,15 +315,16 @@ impl Driver for Configured {
         declared: &[Parameter],
         mut given: Vec<(String, Value)>,
     ) -> Vec<(String, Value)> {
-        for (field, value) in self.configuration.of_skill(&self.skill) {
+        let acting = self.configuration.of_skill(&self.skill);
+        for (field, value) in &acting {
             if let Effect::Sets(parameter) = &field.effect
                 && declared.iter().any(|known| known.name == *parameter)
                 && !given.iter().any(|(name, _)| name == parameter)
             {
-                given.push((parameter.clone(), value));
+                given.push((parameter.clone(), value.clone()));
             }
         }
-        for (field, limit) in self.configuration.of_skill(&self.skill) {
+        for (field, limit) in &acting {
             let Effect::Limits(parameter) = &field.effect else {
                 continue;
             };
@@ -322,10 +332,10 @@ impl Driver for Configured {
                 continue;
             };
             match given.iter_mut().find(|(name, _)| name == parameter) {
-                Some((_, value)) => *value = lowered(value.clone(), &limit),
+                Some((_, value)) => *value = lowered(value.clone(), limit),
                 None => {
                     let default = known.default.clone();
-                    given.extend(default.map(|value| (parameter.clone(), lowered(value, &limit))));
+                    given.extend(default.map(|value| (parameter.clone(), lowered(value, limit))));
                 }
             }
         }
@@ -336,6 +346,7 @@ impl Driver for Configured {
         let configured: Vec<(String, Value)> = self
             .configuration
             .of_skill(&self.skill)
+            .into_iter()
             .map(|(field, value)| (field.facts.name.clone(), value))
             .collect();
         for (name, value) in &configured {
@@ -345,14 +356,25 @@ impl Driver for Configured {
     }
 }
 
-/// Lowers a number, and each number of an array, to a limit.
+/// Lowers a number, and each number of an array, to a limit. A limit that the type cannot hold
+/// takes the place of the whole value, so that the Start is refused.
 fn lowered(value: Value, limit: &Value) -> Value {
     let Some(highest) = limit.as_f64() else {
         return value;
     };
     if let Value::Array(builtin, elements) = value {
-        let elements = elements.into_iter().map(|element| lowered(element, limit));
-        return Value::Array(builtin, elements.collect());
+        let mut fits = true;
+        let elements = elements.into_iter().map(|element| {
+            let shape = element.shape();
+            let element = lowered(element, limit);
+            fits &= element.shape() == shape;
+            element
+        });
+        let elements: Vec<Value> = elements.collect();
+        return match fits {
+            true => Value::Array(builtin, elements),
+            false => limit.clone(),
+        };
     }
     match value.as_f64() {
         Some(number) if number > highest => {
@@ -363,7 +385,7 @@ fn lowered(value: Value, limit: &Value) -> Value {
                 let json: Json = serde_json::from_str(&format!("{:.0}", highest.floor())).ok()?;
                 shape.read_json(&json).ok()
             };
-            whole.ok().or_else(floor).unwrap_or(value)
+            whole.ok().or_else(floor).unwrap_or_else(|| limit.clone())
         }
         _ => value,
     }
@@ -448,7 +470,7 @@ mod tests {
 
     /// Succeeds, and records the force and the configuration of each run.
     #[derive(Default)]
-    struct Recorder(std::sync::Mutex<Vec<(f64, usize)>>);
+    struct Recorder(Mutex<Vec<(f64, usize)>>);
 
     #[async_trait]
     impl Driver for Recorder {
@@ -486,6 +508,32 @@ mod tests {
             seen,
             [(80.0, 0), (30.0, 1), (12.0, 1), (25.0, 2), (30.0, 2)]
         );
+    }
+
+    #[test]
+    fn fields_that_are_set_at_the_same_time_are_all_kept() {
+        let names: Vec<String> = (0..8).map(|number| format!("Field{number}")).collect();
+        let fields = names.iter().map(|name| field(name, Effect::Data, None));
+        let configuration = Configuration::new(fields.collect(), None);
+        std::thread::scope(|scope| {
+            for name in &names {
+                let configuration = configuration.clone();
+                scope.spawn(move || configuration.set(given(name, "A")).unwrap());
+            }
+        });
+        assert_eq!(configuration.watch().borrow().len(), names.len());
+    }
+
+    #[test]
+    fn a_limit_that_the_type_cannot_hold_takes_the_place_of_the_value() {
+        let below = Value::from(-1.0);
+        let bytes = |byte: u8| Value::Array(Builtin::Byte, vec![Value::Byte(byte)]);
+        assert_eq!(lowered(Value::Byte(9), &4.5.into()), Value::Byte(4));
+        assert_eq!(lowered(bytes(9), &4.5.into()), bytes(4));
+        assert_eq!(lowered(Value::Byte(9), &below), below);
+        assert_eq!(lowered(bytes(9), &below), below);
+        assert_eq!(Shape::scalar(Builtin::Byte).take(below.clone()), None);
+        assert_eq!(Shape::array(Builtin::Byte).take(below), None);
     }
 
     #[test]

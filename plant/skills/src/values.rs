@@ -12,6 +12,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use async_trait::async_trait;
+use log_limit::Throttle;
 use serde_json::Value as Json;
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep};
@@ -245,6 +246,7 @@ pub(crate) async fn watch(
 ) {
     let mut pause = SHORTEST_PAUSE;
     let mut logged: Option<String> = None;
+    let mut losses = Throttle::new(TOLD_EVERY);
     let mut is_fixed = false;
     loop {
         let began = Instant::now();
@@ -266,8 +268,10 @@ pub(crate) async fn watch(
         if has_measured {
             pause = SHORTEST_PAUSE;
         }
-        if has_measured || logged.as_ref() != Some(&why) {
-            tracing::warn!(source = sensor.source(), "values are lost: {why}");
+        if (has_measured || logged.as_ref() != Some(&why))
+            && let Some(untold) = losses.admit(Instant::now().into_std())
+        {
+            tracing::warn!(source = sensor.source(), untold, "values are lost: {why}");
             logged = Some(why);
         }
         sleep(pause).await;
@@ -292,6 +296,8 @@ const MISSED_PERIODS: u32 = 10;
 const SHORTEST_WITHIN: Duration = Duration::from_secs(3);
 const SHORTEST_PAUSE: Duration = Duration::from_millis(250);
 const LONGEST_PAUSE: Duration = Duration::from_secs(4);
+/// Shortest time between two log messages about the losses of a sensor.
+const TOLD_EVERY: Duration = Duration::from_secs(10);
 
 #[cfg(test)]
 mod tests {

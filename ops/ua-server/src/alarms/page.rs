@@ -55,14 +55,20 @@ impl Alarms {
                 "Method/Confirm",
             ),
         };
-        let (condition, event) = ids(change)?;
         let method = NodeId::from(method);
+        let may = access.allows(&UserToken(user.to_owned()), &method, Right::Call);
+        let (condition, event) = match ids(change) {
+            Ok(ids) => ids,
+            Err(status) if may => return Err(status),
+            // The denial is audited, without the ids.
+            Err(_) => (NodeId::null(), ByteString::null()),
+        };
         // An empty comment leaves the comment of the condition as it is.
         let comment = match change.comment.trim() {
             "" => LocalizedText::null(),
             text => LocalizedText::from(text),
         };
-        let done = match access.allows(&UserToken(user.to_owned()), &method, Right::Call) {
+        let done = match may {
             false => Err(StatusCode::BadUserAccessDenied),
             true if change.comment.len() > LONGEST_COMMENT => Err(StatusCode::BadOutOfRange),
             true => {

@@ -15,7 +15,7 @@ use uadp::{BuiltinType, DataSetMessage, MessageKind, Scalar, Variant};
 use super::described::{Described, Field, What};
 use super::plain;
 
-/// The channels of all topics with values. A topic with a changed description gets a new channel.
+/// The channels of all topics with values. A topic with a new description gets a new channel.
 pub(super) struct Channels {
     topics: BTreeMap<TopicId, Slot>,
     /// The names of the channels, and the topics that use them.
@@ -31,8 +31,8 @@ pub(super) struct Channels {
 struct Slot {
     /// The time of the first value without a description.
     first: Duration,
-    described: Option<Arc<Described>>,
-    channel: Option<Arc<Channel>>,
+    /// All channels of the topic; the one that was used last is at the end.
+    made: Vec<Arc<Channel>>,
 }
 
 /// The values of a topic in one form.
@@ -68,7 +68,7 @@ enum Form {
 pub(super) enum Unfit {
     /// The writer is asked for the description.
     Undescribed,
-    /// The number of channels is limited.
+    /// The number of channels is limited, of all topics and of each topic.
     Channels,
     /// The value does not match the announced description, or cannot be decoded.
     Mismatch,
@@ -79,7 +79,7 @@ impl Unfit {
     pub(super) const fn label(self) -> &'static str {
         match self {
             Self::Undescribed => "values before the description of their topic",
-            Self::Channels => "values of more topics than there are channels",
+            Self::Channels => "values of more topics and descriptions than there are channels",
             Self::Mismatch => "values that do not match the description of their topic",
         }
     }
@@ -113,25 +113,24 @@ impl Channels {
         described: Option<&Arc<Described>>,
         now: Duration,
     ) -> Result<Arc<Channel>, Unfit> {
-        let slot = self.topics.entry(topic).or_insert(Slot {
+        let slot = self.topics.entry(topic).or_insert_with(|| Slot {
             first: now,
-            described: None,
-            channel: None,
+            made: Vec::new(),
         });
-        if let Some(channel) = &slot.channel
-            && is_same(slot.described.as_ref(), described)
-        {
-            return Ok(Arc::clone(channel));
+        if let Some(channel) = slot.fitting(described) {
+            return Ok(channel);
         }
         if described.is_none() && now < slot.first + DESCRIBED_WITHIN {
             return Err(Unfit::Undescribed);
+        }
+        if slot.made.len() >= MOST_OF_TOPIC {
+            return Err(Unfit::Channels);
         }
         let id = self.last.checked_add(1).ok_or(Unfit::Channels)?;
         self.last = id;
         let channel = Arc::new(self.make(id, topic, described));
         if let Some(slot) = self.topics.get_mut(&topic) {
-            slot.described = described.map(Arc::clone);
-            slot.channel = Some(Arc::clone(&channel));
+            slot.made.push(Arc::clone(&channel));
         }
         Ok(channel)
     }
@@ -238,6 +237,18 @@ impl Channels {
     }
 }
 
+impl Slot {
+    /// Returns the channel of a value with this description. A value without a description is in
+    /// the channel that was used last.
+    fn fitting(&mut self, described: Option<&Arc<Described>>) -> Option<Arc<Channel>> {
+        let fits = |channel: &Arc<Channel>| is_same(channel.described.as_ref(), described);
+        let at = self.made.iter().rposition(fits)?;
+        let channel = self.made.remove(at);
+        self.made.push(Arc::clone(&channel));
+        Some(channel)
+    }
+}
+
 struct Ros {
     message: Arc<MessageType>,
     form: Form,
@@ -279,6 +290,12 @@ impl Channel {
             }
         }
     }
+}
+
+/// Returns whether a message has a value. Keep-alives and invalid messages have none, and neither
+/// have heartbeats, which are headers only.
+pub(super) fn is_value(message: &DataSetMessage<'_>) -> bool {
+    message.kind != MessageKind::KeepAlive && !message.payload().is_empty() && message.is_valid()
 }
 
 /// Returns whether a channel of the first description fits a value with the second.
@@ -385,6 +402,8 @@ const AS_BYTES: &str = " as bytes";
 /// The member of a JSON value with only some of its fields.
 const DELTA: &str = "$delta";
 const MOST_UNKNOWN: usize = 64;
+/// Maximum number of channels of a topic, one for each of its descriptions.
+const MOST_OF_TOPIC: usize = 8;
 
 #[cfg(test)]
 mod tests;

@@ -19,7 +19,8 @@ use transport::{Received, Senders};
 use self::packets::Packets;
 use self::sink::Sink;
 use self::values::Values;
-use super::book::News;
+use super::book::{Kind, News};
+use super::channels::is_value;
 use super::list::{FIRST_ASKED, json};
 use super::text::harmless;
 use super::{Go, Incoming, LOOK, Live, in_group, take, until};
@@ -177,12 +178,16 @@ impl Recording {
             Form::Values(values) => {
                 let mut each = |news: News<'_>, now| {
                     let recorded = match &news {
-                        News::Sample(sample) => values.add(sample, (now, time)),
-                        News::Announced(topic, super::book::Kind::Value, described, _) => {
+                        News::Sample(sample) if is_value(&sample.message) => {
+                            values.add(sample, (now, time))
+                        }
+                        News::Announced(topic, Kind::Value, described, _) => {
                             values.described(*topic, described, now);
                             return Go::On;
                         }
-                        News::Announced(..) | News::Response(..) => return Go::On,
+                        News::Sample(_) | News::Announced(..) | News::Response(..) => {
+                            return Go::On;
+                        }
                     };
                     match recorded {
                         Ok(true) => added += 1,

@@ -16,12 +16,11 @@ use tokio::net::TcpListener;
 
 use self::hub::{Hub, Publication};
 use super::book::{Kind, News};
-use super::channels::{Channels, Unfit};
+use super::channels::{Channels, Unfit, is_value};
 use super::{Go, in_group, until};
 use crate::arguments::Viewers;
 use crate::exit::Failure;
 use crate::report::warn;
-use uadp::MessageKind;
 
 /// Runs `ua-space live`.
 pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
@@ -91,8 +90,7 @@ fn take(news: &News<'_>, (channels, hub): (&mut Channels, &Hub), (start, now): (
         return;
     };
     let message = &sample.message;
-    let is_value = message.kind != MessageKind::KeepAlive && !message.payload().is_empty();
-    if !is_value || !message.is_valid() || !hub.is_wanted(channel.id) {
+    if !is_value(message) || !hub.is_wanted(channel.id) {
         return;
     }
     let mut data = Vec::new();

@@ -35,8 +35,8 @@ pub(crate) fn write(arguments: &Write) -> Result<ExitCode, Failure> {
             look(server::write(arguments, &found))?;
             Ok(ExitCode::SUCCESS)
         }
-        (None, Some(mapping)) => space::write(arguments, mapping),
-        (None, None) => Err(no_writer(arguments)),
+        (None, Some(mapping)) if arguments.server.is_none() => space::write(arguments, mapping),
+        (None, _) => Err(no_writer(arguments)),
     }
 }
 
@@ -263,8 +263,14 @@ impl Tally {
         }
         match written {
             Written::Refused(why) => {
-                let label = label(topic, name);
-                Err(Failure::Failed(format!("{label}: {why}")))
+                let (label, unknown) = (label(topic, name), self.unknown);
+                // The earlier values may have arrived, so the command is more than refused.
+                Err(match unknown {
+                    0 => Failure::Failed(format!("{label}: {why}")),
+                    _ => Failure::Unavailable(format!(
+                        "{label}: {why}; whether {unknown} earlier values arrived is not known"
+                    )),
+                })
             }
             Written::Arrived | Written::Unknown(_) => Ok(()),
         }
@@ -361,6 +367,14 @@ mod tests {
         );
         let refused = Written::Refused("BadUserAccessDenied".to_owned());
         let wrong = tally.take(at, &refused, false).unwrap_err();
+        assert!(matches!(wrong, Failure::Unavailable(_)), "{wrong:?}");
+        assert!(
+            wrong
+                .to_string()
+                .contains("BadUserAccessDenied; whether 1 earlier values"),
+            "{wrong}"
+        );
+        let wrong = Tally::default().take(at, &refused, false).unwrap_err();
         assert!(matches!(wrong, Failure::Failed(_)), "{wrong:?}");
     }
 }

@@ -1,7 +1,10 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-use skills::{Component, DriverSetup, Outcome, conformance};
+use program::{Method, State};
+use skills::{
+    Authority, Component, DriverSetup, Facts, Outcome, Owner, Skill, TypeName, conformance, model,
+};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
@@ -129,6 +132,29 @@ impl Bench {
     fn seen(&self) -> Vec<String> {
         self.press.lock().unwrap().seen.clone()
     }
+
+    fn skill(&self, http: &str) -> Skill {
+        let of = model::find("GraspSkillType").unwrap();
+        let facts = Facts {
+            name: "Grasp".to_owned(),
+            types: vec![TypeName::own("GraspSkillType")],
+            parameters: of.parameters(),
+            results: of.results(),
+            capabilities: Vec::new(),
+            timeout: None,
+            rests_in: of.rests_in,
+        };
+        Skill::spawn(facts, self.driver(http), Authority::new(), Vec::new())
+    }
+}
+
+const BY: Owner = Owner::Local("the test");
+
+async fn start(skill: &Skill) {
+    if skill.shown().state == State::Halted {
+        skill.call(BY, Method::Reset).await.unwrap();
+    }
+    skill.start_with(BY, Vec::new()).await.unwrap();
 }
 
 fn driver(http: &str) -> Result<Arc<dyn Driver>, String> {
@@ -166,7 +192,7 @@ async fn a_run_is_started_with_its_parameters_and_polled_to_its_results() {
 }
 
 #[tokio::test]
-async fn it_is_as_a_driver_should_be_and_halt_stops_the_device() {
+async fn it_is_as_a_driver_should_be() {
     let bench = Bench::new(200, &[]).await;
     let press = Arc::clone(&bench.press);
     let again = move || {
@@ -178,8 +204,60 @@ async fn it_is_as_a_driver_should_be_and_halt_stops_the_device() {
     conformance::check("GraspSkillType", bench.driver(POLLED), again)
         .await
         .unwrap();
-    let seen = bench.seen();
-    assert!(seen.iter().any(|line| line == "POST /stop"), "{seen:?}");
+}
+
+#[tokio::test]
+async fn halt_stops_the_device_also_while_a_response_is_slow() {
+    for last in ["running", ""] {
+        let bench = Bench::new(200, &["running", last]).await;
+        let skill = bench.skill(&POLLED.replace("within: 1 s", "within: 3 s"));
+        start(&skill).await;
+        let polls = || {
+            let seen = bench.seen();
+            seen.iter().filter(|line| *line == "GET /state").count()
+        };
+        while polls() < 2 {
+            sleep(Duration::from_millis(2)).await;
+        }
+        skill.call(BY, Method::Halt).await.unwrap();
+        assert_eq!(skill.shown().state, State::Halted);
+        let seen = bench.seen();
+        assert!(seen.iter().any(|line| line == "POST /stop"), "{seen:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_request_that_is_withdrawn_before_it_is_sent_is_not_sent() {
+    let bench = Bench::new(200, &[]).await;
+    let asked = Asked {
+        method: "POST",
+        path: "/start",
+        body: None,
+        within: WITHIN,
+    };
+    let host = Host(bench.address.clone());
+    let fault = host.ask_unless(asked, || true).await.unwrap_err();
+    let why = "Halt came before the request was sent".to_owned();
+    assert_eq!(fault, Fault::Unreachable(why));
+    assert!(bench.seen().is_empty());
+}
+
+#[tokio::test]
+async fn damaged_results_are_an_unknown_outcome() {
+    let bench = Bench::new(200, &[]).await;
+    let skill = bench.skill("{start: PRESS/start, results: {Gripped: /held}, stop: PRESS/stop}");
+    start(&skill).await;
+    let mut watch = skill.watch();
+    let ended = watch.wait_for(|shown| shown.state == State::Halted).await;
+    assert!(ended.unwrap().needs_reset);
+    assert!(bench.press.lock().unwrap().stopped);
+}
+
+#[test]
+fn the_parameters_of_the_stop_request_are_checked_too() {
+    let stop = driver("{start: \"http://h/x\", stop: \"http://h/{Speed}\"}").unwrap();
+    let refused = stop.check(&Parameters::default()).unwrap_err();
+    assert_eq!(refused, "Speed is not a parameter of the skill");
 }
 
 #[tokio::test]
@@ -228,11 +306,8 @@ async fn a_response_can_be_the_end_of_the_run() {
     let outcome = bench
         .run("{start: PRESS/start, results: {Gripped: /held}}")
         .await;
-    assert!(
-        outcome.message.contains("the response has no /held"),
-        "{}",
-        outcome.message
-    );
+    let expected = "Gripped: the response has no /held; there is no `stop` request";
+    assert_eq!(outcome.message, expected);
 }
 
 #[test]

@@ -56,7 +56,11 @@ impl Driver for Run {
         };
         tokio::select! {
             prepared = self.prepare(&shake, &work) => prepared?,
-            () = work.stopped() => return Err("stopped before Start".to_owned()),
+            () = work.stopped() => {
+                // A Reset that was written has no effect later.
+                let _removed = shake.withdraw().await;
+                return Err("stopped before Start".to_owned());
+            }
         }
         self.start(&shake, &work).await?;
         self.follow(&shake, &work).await
@@ -102,10 +106,10 @@ impl Run {
                 "the service was reset and is to be Idle",
                 self.timing.handshake,
             );
-            shake
-                .until(|state| state == StateWord::Known(State::Idle), within)
-                .await?;
-            return shake.withdraw().await;
+            let is_idle = |state| state == StateWord::Known(State::Idle);
+            let reached = shake.until(is_idle, within).await;
+            shake.withdraw().await?;
+            return reached.map(drop);
         }
         match state == StateWord::Known(State::Idle) {
             true => Ok(()),
@@ -124,7 +128,11 @@ impl Run {
         let sent = shake.command(Command::Start).await;
         let is_idle = |state| state == StateWord::Known(State::Idle);
         let within = ("Start was written", self.timing.handshake);
-        let Err(why) = shake.until(|state| !is_idle(state), within).await else {
+        let started = tokio::select! {
+            started = shake.until(|state| !is_idle(state), within) => started,
+            () = work.stopped() => Err("stopped before the service left Idle".to_owned()),
+        };
+        let Err(why) = started else {
             return shake.withdraw().await.or(Ok(()));
         };
         let why = match sent {
@@ -148,12 +156,15 @@ impl Run {
 
     /// Follows the procedure to its end.
     async fn follow(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, String> {
-        let run_time = work.parameters().number(RUN_TIME).unwrap_or_default();
+        let run_time = match has_run_time(&self.procedure, &self.parameters) {
+            true => work.parameters().number(RUN_TIME).unwrap_or_default(),
+            false => 0.0,
+        };
         let run_time = Duration::try_from_secs_f64(run_time).unwrap_or_default();
         let mut shown = None;
         let mut executed = Duration::ZERO;
         let mut has_executed = false;
-        let mut is_completing = false;
+        let mut completing: Option<Instant> = None;
         let mut answered = Instant::now();
         loop {
             let before = Instant::now();
@@ -179,12 +190,13 @@ impl Run {
                         self.compare(work).await;
                     }
                     let is_over = !run_time.is_zero() && executed >= run_time;
-                    if is_over && !is_completing {
-                        if let Err(why) = complete(shake).await {
-                            let end = self.stop(shake, work).await;
-                            return Err(format!("{why}; {end}"));
-                        }
-                        is_completing = true;
+                    let completed = match is_over {
+                        true => self.complete(shake, &mut completing).await,
+                        false => Ok(()),
+                    };
+                    if let Err(why) = completed {
+                        let end = self.stop(shake, work).await;
+                        return Err(format!("{why}; {end}"));
                     }
                 }
                 Ok(_) => {}
@@ -208,18 +220,34 @@ impl Run {
                         let end = self.stop(shake, work).await;
                         return Err(if why.is_empty() { end } else { format!("{why}; {end}") });
                     }
+                    // A service that was held executes again.
+                    completing = None;
                 }
                 () = sleep(self.timing.poll) => {}
             }
             if state == Ok(StateWord::Known(State::Execute)) {
                 executed += before.elapsed();
-                if !run_time.is_zero() {
-                    let share = executed.as_secs_f64() / run_time.as_secs_f64();
-                    // A share of 1 has enough digits.
-                    #[expect(clippy::cast_possible_truncation, reason = "a share from 0 to 1")]
-                    work.progress(share.min(1.0) as f32);
-                }
+                show_progress(work, executed, run_time);
             }
+        }
+    }
+
+    /// Completes a procedure that does not complete by itself: once, and with a time limit.
+    async fn complete(
+        &self,
+        shake: &Handshake<'_>,
+        since: &mut Option<Instant>,
+    ) -> Result<(), String> {
+        match *since {
+            None => {
+                *since = Some(Instant::now());
+                shake.allowed(Command::Complete).await?;
+                shake.command(Command::Complete).await
+            }
+            Some(since) if since.elapsed() > self.timing.handshake => {
+                Err("Complete had no effect".to_owned())
+            }
+            Some(_) => Ok(()),
         }
     }
 
@@ -257,18 +285,35 @@ impl Run {
 
     /// Stops the service: Stop, or Abort if Stop is not allowed. Returns the reason for the end.
     async fn stop(&self, shake: &Handshake<'_>, work: &Work) -> String {
-        let command = match shake.allows(Command::Stop).await {
-            Ok(true) | Err(_) => Command::Stop,
-            Ok(false) => Command::Abort,
-        };
         let is_at_end = |state| {
             matches!(
                 state,
                 StateWord::Known(State::Stopped | State::Aborted | State::Completed | State::Idle)
             )
         };
-        let sent = shake.command(command).await;
-        let within = ("the service is to be Stopped", self.timing.stop);
+        let end = Instant::now() + self.timing.stop;
+        let mut command = Command::Stop;
+        // A connection that is lost for a moment comes back.
+        let sent = loop {
+            let sent = match shake.state().await {
+                Ok(StateWord::Known(State::Stopping | State::Aborting)) => Ok(()),
+                Ok(state) if is_at_end(state) => Ok(()),
+                Ok(_) => {
+                    command = match shake.allows(Command::Stop).await {
+                        Ok(false) => Command::Abort,
+                        Ok(true) | Err(_) => Command::Stop,
+                    };
+                    shake.command(command).await
+                }
+                Err(why) => Err(why),
+            };
+            if sent.is_ok() || Instant::now() >= end {
+                break sent;
+            }
+            sleep(self.timing.poll).await;
+        };
+        let left = end.saturating_duration_since(Instant::now());
+        let within = ("the service is to be Stopped", left);
         match shake.until(is_at_end, within).await {
             Ok(state) => {
                 // The end is known; a command that stays in place is removed by the next run.
@@ -311,12 +356,20 @@ impl Run {
         work.progress(1.0);
         // The procedure is done; a command that stays in place is removed by the next run.
         let _removed = shake.withdraw().await;
+        let end = Instant::now() + self.timing.lost;
         let mut results = Vec::new();
         for output in outputs(&self.service, &self.procedure) {
             let Some(node) = &output.node else { continue };
-            let read = self.nodes.read(&[node]).await?;
-            let value = read.into_iter().next().flatten();
-            let value = value.ok_or_else(|| format!("the result {} has no value", output.name))?;
+            let value = match self.result(node, end).await {
+                Ok(value) => value,
+                Err(why) => {
+                    let name = &output.name;
+                    let what =
+                        format!("the service is Completed, the result {name} is unknown: {why}");
+                    work.unknown(what.clone()).await;
+                    return Err(what);
+                }
+            };
             let value = match (output.kind, value.as_f64()) {
                 (mtp::ValueKind::Analog, Some(number)) => Value::Double(number),
                 _ => value,
@@ -325,12 +378,42 @@ impl Run {
         }
         Ok(results)
     }
+
+    /// Reads a result. A connection that is lost for a moment comes back.
+    async fn result(&self, node: &mtp::Node, end: Instant) -> Result<Value, String> {
+        loop {
+            let why = match self.nodes.read(&[node]).await {
+                Ok(read) => match read.into_iter().next().flatten() {
+                    Some(value) => return Ok(value),
+                    None => "it has no value".to_owned(),
+                },
+                Err(why) => why,
+            };
+            if Instant::now() >= end {
+                return Err(why);
+            }
+            sleep(self.timing.poll).await;
+        }
+    }
 }
 
-/// Completes a procedure that does not complete by itself.
-async fn complete(shake: &Handshake<'_>) -> Result<(), String> {
-    shake.allowed(Command::Complete).await?;
-    shake.command(Command::Complete).await
+fn show_progress(work: &Work, executed: Duration, run_time: Duration) {
+    if !run_time.is_zero() {
+        let share = executed.as_secs_f64() / run_time.as_secs_f64();
+        // A share of 1 has enough digits.
+        #[expect(clippy::cast_possible_truncation, reason = "a share from 0 to 1")]
+        work.progress(share.min(1.0) as f32);
+    }
+}
+
+/// Returns whether a skill has the parameter [`RUN_TIME`]: its procedure does not complete by
+/// itself, and has no parameter of this name.
+pub(super) fn has_run_time<'p>(
+    procedure: &Procedure,
+    parameters: impl IntoIterator<Item = &'p Parameter>,
+) -> bool {
+    let mut parameters = parameters.into_iter();
+    !procedure.is_self_completing && !parameters.any(|one| one.name == RUN_TIME)
 }
 
 /// The parameter of procedures that do not complete by themselves.

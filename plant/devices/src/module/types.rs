@@ -13,7 +13,7 @@ pub(super) struct SkillTypeXml<'a> {
     pub(super) about: String,
     pub(super) parameters: Vec<&'a Parameter>,
     pub(super) outputs: Vec<&'a Output>,
-    pub(super) is_self_completing: bool,
+    pub(super) has_run_time: bool,
 }
 
 /// A variable of a skill type.
@@ -70,7 +70,7 @@ fn skill_type(out: &mut String, id: &mut u32, skill: &SkillTypeXml<'_>) {
             value: None,
         })
         .collect();
-    if !skill.is_self_completing {
+    if skill.has_run_time {
         parameters.push(VariableXml {
             name: RUN_TIME.to_owned(),
             builtin: Builtin::Double,

@@ -108,7 +108,7 @@ async fn silence_a_protective_stop_and_a_reboot_are_told_and_do_not_last() {
         async move {
             let changed = async {
                 while simulator.pose()[0] > 0.3 {
-                    tokio::time::sleep(Duration::from_millis(2)).await;
+                    sleep(Duration::from_millis(2)).await;
                 }
                 change(&simulator);
             };
@@ -124,6 +124,13 @@ async fn silence_a_protective_stop_and_a_reboot_are_told_and_do_not_last() {
     let told = between(Simulator::reboot).await;
     assert!(told.contains(" is lost: "), "{told}");
     assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
+    let told = between(|robot| robot.set_silent(true)).await;
+    assert!(
+        told.ends_with(" is silent for 1s; the outcome is unknown, the stop program is sent"),
+        "{told}"
+    );
+    bench.simulator.set_silent(false);
+    assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
 }
 
 #[tokio::test]
@@ -134,7 +141,7 @@ async fn a_program_of_somebody_else_is_told_and_not_taken_for_ours() {
     let simulator = bench.simulator.clone();
     let intruder = async move {
         while simulator.pose()[0] > 0.3 {
-            tokio::time::sleep(Duration::from_millis(2)).await;
+            sleep(Duration::from_millis(2)).await;
         }
         let mut stream = TcpStream::connect(secondary).await.unwrap();
         stream

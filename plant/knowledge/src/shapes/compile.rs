@@ -114,6 +114,10 @@ impl Shapes {
                     continue;
                 }
             };
+            if targets.len() > MAX_TEXT {
+                ignored.push(format!("{shape}: it has too many targets"));
+                continue;
+            }
             self.shape(shape, &targets, (&mut checks, &mut ignored));
             for property in self.all(shape, "property") {
                 match resource(property) {
@@ -128,8 +132,14 @@ impl Shapes {
                 }
             }
         }
-        ignored.truncate(MAX_IGNORED);
-        checks.truncate(MAX_CHECKS);
+        if ignored.len() > MAX_IGNORED {
+            ignored.truncate(MAX_IGNORED);
+            ignored.push("further parts of shapes".to_owned());
+        }
+        if checks.len() > MAX_CHECKS {
+            checks.truncate(MAX_CHECKS);
+            ignored.push(format!("constraints beyond the first {MAX_CHECKS}"));
+        }
         (checks, ignored)
     }
 
@@ -139,6 +149,9 @@ impl Shapes {
         targets: &str,
         (checks, ignored): (&mut Vec<Check>, &mut Vec<String>),
     ) {
+        if checks.len() > MAX_CHECKS {
+            return;
+        }
         let path = match self.one(shape, "path") {
             None => None,
             Some(term) => match self.path(term, 0) {
@@ -155,6 +168,10 @@ impl Shapes {
             path,
         };
         for (predicate, value) in self.about(shape) {
+            // One more than are kept shows that there are more.
+            if checks.len() > MAX_CHECKS {
+                return;
+            }
             let Some(term) = predicate.strip_prefix(SHACL) else {
                 continue;
             };
@@ -210,22 +227,26 @@ impl Shapes {
         Ok(targets)
     }
 
-    /// Returns a path in SPARQL.
+    /// Returns a path in SPARQL, if it is supported and not too long.
     fn path(&self, term: &Term, depth: usize) -> Option<String> {
         if depth > MAX_DEPTH {
             return None;
         }
         if let Some(predicate) = named(term) {
-            return Some(predicate);
+            return bounded(predicate);
         }
         let node = resource(term)?;
+        // Lists of lists grow with each level, so that the length is checked at each part.
         let joined = |list: &Term, separator: &str| {
-            let parts = self.list(list)?;
-            let parts: Option<Vec<String>> = parts
-                .into_iter()
-                .map(|part| self.path(part, depth + 1))
-                .collect();
-            Some(format!("({})", parts?.join(separator)))
+            let mut path = String::new();
+            for part in self.list(list)? {
+                if !path.is_empty() {
+                    path.push_str(separator);
+                }
+                path.push_str(&self.path(part, depth + 1)?);
+                path = bounded(path)?;
+            }
+            bounded(format!("({path})"))
         };
         if let Some(list) = self.one(&node, "alternativePath") {
             return joined(list, "|");
@@ -238,7 +259,7 @@ impl Shapes {
         ] {
             if let Some(inner) = self.one(&node, term) {
                 let inner = self.path(inner, depth + 1)?;
-                return Some(format!("({before}({inner}){after})"));
+                return bounded(format!("({before}({inner}){after})"));
             }
         }
         joined(term, "/")
@@ -393,9 +414,10 @@ impl Shapes {
             first.make_ascii_uppercase();
         }
         let message = match self.one(scope.shape, "message") {
-            Some(Term::Literal(message)) => message.value().to_owned(),
-            _ => what,
+            Some(Term::Literal(message)) => message.value(),
+            _ => what.as_str(),
         };
+        let message = message.chars().take(MAX_MESSAGE).collect();
         let severity = match self.one(scope.shape, "severity") {
             Some(Term::NamedNode(severity)) => severity.clone(),
             _ => NamedNode::new_unchecked(format!("{SHACL}Violation")),
@@ -413,6 +435,11 @@ impl Shapes {
             ),
         }
     }
+}
+
+/// Returns a path or a part of one, if it is not too long.
+fn bounded(path: String) -> Option<String> {
+    (path.len() <= MAX_TEXT).then_some(path)
 }
 
 fn number(value: &Term) -> Option<u32> {
@@ -460,3 +487,81 @@ const MAX_ROWS: usize = 1000;
 const MAX_DEPTH: usize = 16;
 const MAX_CHECKS: usize = 1000;
 const MAX_IGNORED: usize = 100;
+/// Maximum length of a path, and of the targets of a shape, in bytes.
+const MAX_TEXT: usize = 8 << 10;
+/// Maximum length of a message in characters.
+const MAX_MESSAGE: usize = 1000;
+
+#[cfg(test)]
+mod tests {
+    use oxigraph::io::{RdfFormat, RdfParser};
+
+    use super::*;
+
+    fn checks(turtle: &str) -> (Vec<Check>, Vec<String>) {
+        let turtle = format!("@prefix sh: <{SHACL}> . {turtle}");
+        let mut shapes = Shapes::default();
+        for quad in RdfParser::from_format(RdfFormat::Turtle).for_slice(turtle.as_str()) {
+            shapes.add(quad.unwrap().into());
+        }
+        shapes.checks()
+    }
+
+    fn many(count: usize, before: &str, after: &str, separator: &str) -> String {
+        let all = (0..count).map(|number| format!("{before}{number}{after}"));
+        all.collect::<Vec<_>>().join(separator)
+    }
+
+    #[test]
+    fn parts_beyond_the_limits_are_named() {
+        let classes = many(1200, "<urn:c", ">", ", ");
+        let text = format!("<urn:s> sh:targetNode <urn:x> ; sh:class {classes} .");
+        let (found, ignored) = checks(&text);
+        assert_eq!(found.len(), MAX_CHECKS);
+        assert_eq!(ignored, ["constraints beyond the first 1000"]);
+        let shapes = many(150, "<urn:n", ">", ", ");
+        let text = format!("<urn:s> sh:targetNode <urn:x> ; sh:not {shapes} .");
+        let (found, ignored) = checks(&text);
+        assert!(found.is_empty());
+        assert_eq!(ignored.len(), MAX_IGNORED + 1);
+        assert_eq!(ignored.last().unwrap(), "further parts of shapes");
+    }
+
+    #[test]
+    fn long_targets_and_paths_are_named() {
+        let targets = many(300, "<urn:target", ">", ", ");
+        let text = format!("<urn:s> sh:targetNode {targets} ; sh:class <urn:c> .");
+        let (found, ignored) = checks(&text);
+        assert!(found.is_empty());
+        assert_eq!(ignored, ["<urn:s>: it has too many targets"]);
+        let of_path = |path: &str| {
+            checks(&format!(
+                "<urn:s> sh:targetNode <urn:x> ; sh:property <urn:q> .
+                 <urn:q> sh:minCount 1 ; sh:path {path} ."
+            ))
+        };
+        let long = format!("( {} )", many(900, "<urn:p", ">", " "));
+        // Sixteen levels of two parts each have 65536 predicates.
+        let mut nested = "_:l15 . _:l0 sh:alternativePath ( <urn:p> <urn:p> )".to_owned();
+        for level in 1..16 {
+            let below = level - 1;
+            let list = format!(" . _:l{level} sh:alternativePath ( _:l{below} _:l{below} )");
+            nested.push_str(&list);
+        }
+        for path in [long, nested] {
+            let (found, ignored) = of_path(&path);
+            assert!(found.is_empty());
+            assert_eq!(ignored, ["<urn:q>: its sh:path is not supported"]);
+        }
+        assert_eq!(of_path("( <urn:p> <urn:r> )").0.len(), 1);
+    }
+
+    #[test]
+    fn messages_are_cut() {
+        let text = "ö".repeat(5000);
+        let text =
+            format!("<urn:s> sh:targetNode <urn:x> ; sh:class <urn:c> ; sh:message \"{text}\" .");
+        let (found, _) = checks(&text);
+        assert_eq!(found.first().unwrap().message.chars().count(), MAX_MESSAGE);
+    }
+}

@@ -268,7 +268,7 @@ impl<'a> Evaluator<'a> {
             nodes.extend_from_slice(found);
         }
         ordered(&mut nodes);
-        for predicate in &join.rest {
+        for predicate in join.rest.iter() {
             nodes = self.filter(nodes, predicate, at.row, work)?;
         }
         Ok(nodes)
@@ -537,6 +537,7 @@ impl Found<'_, '_> {
 
     fn following(&mut self, node: Node<'_, '_>) -> Evaluated<()> {
         for ancestor in node.ancestors() {
+            self.work.spend(1)?;
             for sibling in ancestor.next_siblings().skip(1) {
                 self.nodes(sibling.descendants())?;
             }
@@ -546,6 +547,7 @@ impl Found<'_, '_> {
 
     fn preceding(&mut self, node: Node<'_, '_>) -> Evaluated<()> {
         for ancestor in node.ancestors() {
+            self.work.spend(1)?;
             for sibling in ancestor.prev_siblings().skip(1) {
                 self.nodes(sibling.descendants().rev())?;
             }

@@ -433,8 +433,8 @@ fn join(before: &str, step: &Step) -> Option<Join> {
     let key = format!("{before}{:?}{:?}{candidate:?}", step.axis, step.test);
     Some(Join {
         key: Arc::from(key),
-        candidate: (**candidate).clone(),
-        probe: (**probe).clone(),
+        candidate: Arc::new((**candidate).clone()),
+        probe: Arc::new((**probe).clone()),
         rest: rest.map(|(_, one)| one.clone()).collect(),
     })
 }
@@ -466,3 +466,24 @@ const AXES: [(&str, Axis); 12] = [
 const MAX_DEPTH: usize = 64;
 const MAX_OPERATORS: usize = 256;
 const MAX_LENGTH: usize = 16 << 10;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// With a copy of the index in each outer one, these would have 2^40 steps.
+    #[test]
+    fn nested_indexes_are_read_at_once() {
+        let mut plain = "/a".to_owned();
+        let mut joined = "current()/x".to_owned();
+        for _ in 0..40 {
+            plain = format!("/a[{plain}]");
+            joined = format!("/a[b={joined}]");
+        }
+        for text in [plain, joined] {
+            let expr = parse(&text, &[]).unwrap();
+            assert_eq!(expr, parse(&text, &[]).unwrap());
+            assert!(format!("{expr:?}").len() < 40_000, "{text}");
+        }
+    }
+}

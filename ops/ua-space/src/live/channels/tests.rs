@@ -113,3 +113,53 @@ fn values_wait_for_their_description_and_a_new_description_makes_a_new_channel()
     let again = channels.channel(of, Some(&point.clone()), NOW).unwrap();
     assert!(first.id > late.id && first.id == again.id);
 }
+
+#[test]
+fn each_description_of_a_topic_has_one_channel_and_their_number_is_limited() {
+    let mut channels = Channels::new();
+    let of = topic("ua_2_5_10");
+    let [first, second] = ["first", "second"].map(|text| described(text, &XYZ));
+    let one = channels.channel(of, Some(&first), NOW).unwrap().id;
+    let two = channels.channel(of, Some(&second), NOW).unwrap().id;
+    assert_ne!(one, two);
+    for _ in 0..3 {
+        for (described, id) in [(&first, one), (&second, two)] {
+            let again = channels.channel(of, Some(described), NOW).unwrap();
+            assert_eq!(again.id, id);
+            assert_eq!(channels.channel(of, None, NOW).unwrap().id, id);
+        }
+    }
+    for number in 2..MOST_OF_TOPIC {
+        let other = described(&number.to_string(), &XYZ);
+        channels.channel(of, Some(&other), NOW).unwrap();
+    }
+    let other = described("other", &XYZ);
+    let refused = channels.channel(of, Some(&other), NOW);
+    assert_eq!(refused.unwrap_err(), Unfit::Channels);
+    assert_eq!(channels.channel(of, Some(&first), NOW).unwrap().id, one);
+}
+
+#[test]
+fn keep_alives_heartbeats_and_invalid_messages_are_no_values() {
+    let valid = DataSetHeader::default();
+    let invalid = DataSetHeader {
+        valid: false,
+        ..valid
+    };
+    let mut datagram = Vec::new();
+    let none = NetworkHeader::default();
+    let ids: [u16; 4] = [1, 2, 3, 4];
+    let mut writer = NetworkMessageEncoder::new(&mut datagram, &none, Some(&ids)).unwrap();
+    for header in [valid, invalid] {
+        let mut frame = writer.key_frame(&header).unwrap();
+        frame.scalar(Scalar::Byte(1)).unwrap();
+        frame.finish().unwrap();
+    }
+    writer.heartbeat(&valid).unwrap();
+    writer.keep_alive(&valid).unwrap();
+    writer.finish().unwrap();
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    let all = message.messages().map(|one| is_value(&one.unwrap()));
+    let all: Vec<bool> = all.collect();
+    assert_eq!(all, [true, false, false, false]);
+}

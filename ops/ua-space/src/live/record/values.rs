@@ -76,12 +76,6 @@ impl Values {
         sample: &Sample<'_>,
         (now, time): (Duration, i128),
     ) -> Result<bool, Failure> {
-        // A heartbeat is a key frame without fields.
-        let message = &sample.message;
-        let is_value = message.kind != MessageKind::KeepAlive && !message.payload().is_empty();
-        if !is_value || !message.is_valid() {
-            return Ok(true);
-        }
         if self.writer.waiting() >= CHUNK && !self.flush()? {
             return Ok(false);
         }

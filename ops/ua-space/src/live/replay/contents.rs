@@ -18,7 +18,7 @@ use crate::arguments::Replay;
 use crate::capture::Capture;
 use crate::exit::Failure;
 use crate::input::{self, Input};
-use crate::live::book::{BAD, Book, Kind};
+use crate::live::book::{BAD, Book, Kind, News};
 use crate::live::described::{Described, topic_of};
 use crate::live::sealing::Sealing;
 use crate::packet::{self, Found, Fragments};
@@ -144,6 +144,7 @@ pub(super) struct Contents {
     /// The time of the first message of the space.
     pub(super) first: i128,
     book: Book,
+    /// The first description of each topic, and one that acts.
     descriptions: BTreeMap<TopicId, Vec<Arc<Described>>>,
     /// The newest announcement of each topic.
     announcements: BTreeMap<TopicId, Vec<u8>>,
@@ -185,14 +186,10 @@ impl Contents {
                 None => message,
             };
             let from = datagram.from;
-            contents.book.handle((&message, from), now, &mut |_| {});
+            let descriptions = &mut contents.descriptions;
+            let mut each = |news: News<'_>| describe(descriptions, &news);
+            contents.book.handle((&message, from), now, &mut each);
             contents.announcement(&message, (&mut reassembler, from), now);
-        }
-        for (topic, kind, described, _) in contents.book.all_announced() {
-            if kind == Kind::Value {
-                let all = contents.descriptions.entry(topic).or_default();
-                all.push(Arc::clone(described));
-            }
         }
         Ok(contents)
     }
@@ -233,8 +230,13 @@ impl Contents {
 
     /// Returns the topics with the number of their values, and the reason why they are left out.
     pub(super) fn topics(&self) -> impl Iterator<Item = (TopicId, u64, Option<LeftOut>)> {
-        let topics = self.book.topics();
-        topics.map(|(topic, heard)| (topic, heard.values, self.left_out(topic)))
+        self.book.topics().map(|(topic, heard)| {
+            let why = self.left_out(topic);
+            // The keys do not help if the space is not wanted.
+            let is_closed = heard.secured && why != Some(LeftOut::OtherSpace);
+            let closed = is_closed.then_some(LeftOut::Secured);
+            (topic, heard.values, closed.or(why))
+        })
     }
 
     /// Returns the description of a topic.
@@ -244,7 +246,8 @@ impl Contents {
 
     /// Returns the spaces with messages to send.
     pub(super) fn spaces(&self) -> BTreeSet<u16> {
-        let sent = self.topics().filter(|(.., left_out)| left_out.is_none());
+        let topics = self.book.topics();
+        let sent = topics.filter(|(topic, _)| self.left_out(*topic).is_none());
         let mut spaces: BTreeSet<u16> = sent.map(|(topic, ..)| topic.space.into()).collect();
         if self.commands {
             let wanted = |space: &u16| SpaceId::new(*space).is_some_and(|of| self.is_wanted(of));
@@ -377,8 +380,28 @@ enum Place {
 
 /// Returns whether a value acts where it arrives.
 fn acts(described: &Described) -> bool {
-    let moves = |name: &str| name.parse().is_ok_and(|name| Motion::of(&name).is_some());
     described.command || described.ros_type().is_some_and(moves)
+}
+
+/// Returns whether messages of a ROS type command a movement.
+fn moves(name: &str) -> bool {
+    let is_motion = name.parse().is_ok_and(|name| Motion::of(&name).is_some());
+    let own = name.rsplit('/').next().unwrap_or_default();
+    is_motion
+        || own.ends_with("ActionGoal")
+        || matches!(own, "JointJog" | "MultiDOFJointTrajectory")
+}
+
+/// Keeps the first description of a topic, and the first that acts. Values of a topic act if one of
+/// its writers said so at any time: a mapping changes, and a program ends.
+fn describe(descriptions: &mut BTreeMap<TopicId, Vec<Arc<Described>>>, news: &News<'_>) {
+    let News::Announced(topic, Kind::Value, described, _) = news else {
+        return;
+    };
+    let all = descriptions.entry(*topic).or_default();
+    if all.is_empty() || (acts(described) && !all.iter().any(|one| acts(one))) {
+        all.push(Arc::clone(described));
+    }
 }
 
 /// Returns the topic that an announcement describes; `None` also for the end of a topic.

@@ -173,3 +173,64 @@ fn large_calls_and_probes_are_left_out() {
     assert_eq!(sent(&all, &chunk), Ok(Vec::new()));
     std::fs::remove_file(file).unwrap();
 }
+
+#[test]
+fn a_topic_that_commanded_at_any_time_is_left_out() {
+    let messages = [
+        announced(1, 10, "std_msgs/Bool", false),
+        announced(1, 10, "std_msgs/Bool", true),
+        announced(1, 10, "std_msgs/Bool", false),
+        announced(1, 11, "control_msgs/JointJog", false),
+        announced(1, 12, "trajectory_msgs/MultiDOFJointTrajectory", false),
+        announced(1, 13, "move_base_msgs/MoveBaseActionGoal", false),
+        announced(1, 14, "move_base_msgs/MoveBaseActionResult", false),
+        values(1, 2, &[10, 11, 12, 13, 14]),
+    ];
+    let file = recording("once", &messages);
+    let contents = read(&file, &[]);
+    let [.., of_ros] = &messages;
+    assert_eq!(sent(&contents, of_ros), Ok(vec![14]));
+    let prepared = contents.prepare(of_ros, &mut None).unwrap();
+    assert_eq!(prepared.removed, BTreeMap::from([(LeftOut::Command, 4)]));
+    std::fs::remove_file(file).unwrap();
+}
+
+#[test]
+fn secured_topics_are_shown_as_secured_without_keys() {
+    let network = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(1)),
+        group: Some(GroupHeader {
+            writer_group_id: Some(2),
+            ..GroupHeader::default()
+        }),
+        ..NetworkHeader::default()
+    };
+    let extras = Extras {
+        security: Some(SecurityHeader {
+            signed: true,
+            ..SecurityHeader::NONE
+        }),
+        ..Extras::default()
+    };
+    let ids: [u16; 1] = [10];
+    let mut sealed = Vec::new();
+    let begun = NetworkMessageEncoder::with(&mut sealed, &network, Some(&ids), &extras);
+    assert!(begun.is_ok());
+    // Without keys nothing behind the headers is read.
+    sealed.extend([0; 40]);
+    let file = recording("secured", &[sealed]);
+    let topic: TopicId = "ua_1_2_10".parse().unwrap();
+    let cases: [(&[&str], LeftOut, &[u16]); 3] = [
+        (&[], LeftOut::Secured, &[]),
+        (&["--commands"], LeftOut::Secured, &[1]),
+        (&["--space", "0"], LeftOut::OtherSpace, &[]),
+    ];
+    for (words, why, spaces) in cases {
+        let contents = read(&file, words);
+        let topics: Vec<_> = contents.topics().collect();
+        assert_eq!(topics, [(topic, 1, Some(why))]);
+        let spaces: BTreeSet<u16> = spaces.iter().copied().collect();
+        assert_eq!(contents.spaces(), spaces);
+    }
+    std::fs::remove_file(file).unwrap();
+}

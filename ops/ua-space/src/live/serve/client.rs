@@ -6,6 +6,7 @@
 
 use std::net::IpAddr;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use futures_util::{SinkExt as _, StreamExt as _};
@@ -88,6 +89,8 @@ async fn exchange(stream: WebSocketStream<TcpStream>, hub: &Hub, client: &Client
     tokio::select! {
         () = sending => {}
         () = receiving => {}
+        // The sender may wait for the viewer, so it cannot end the connection.
+        () = client.given_up.notified() => {}
     }
 }
 
@@ -100,10 +103,7 @@ fn negotiate(
 ) -> Result<Response, ErrorResponse> {
     let headers = request.headers();
     if let Some(origin) = foreign_origin(headers, origins) {
-        let origin = harmless(&origin);
-        warn(&format!(
-            "refused a viewer in a page of {origin}; --origin {origin} admits it"
-        ));
+        warn_of_page(&origin);
         return Err(refusal(
             StatusCode::FORBIDDEN,
             "this web page may not connect",
@@ -122,6 +122,18 @@ fn negotiate(
     let headers = response.headers_mut();
     headers.insert(PROTOCOL, HeaderValue::from_static(chosen));
     Ok(response)
+}
+
+/// Reports a refused web page. A page can try again without end, so the reports are limited.
+fn warn_of_page(origin: &str) {
+    static REFUSED: AtomicUsize = AtomicUsize::new(0);
+    let before = REFUSED.fetch_add(1, Ordering::Relaxed);
+    if before < MOST_WARNINGS {
+        let origin = harmless(origin);
+        warn(&format!(
+            "refused a viewer in a page of {origin}; --origin {origin} admits it"
+        ));
+    }
 }
 
 /// Returns the origin of a web page that may not connect. Programs send no origin, or an origin
@@ -164,6 +176,8 @@ const PROTOCOL: &str = "sec-websocket-protocol";
 /// The protocols, the newest first.
 const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 const HANDSHAKE_WITHIN: Duration = Duration::from_secs(5);
+/// Maximum number of reports of refused web pages.
+const MOST_WARNINGS: usize = 20;
 const PAUSE: Duration = Duration::from_millis(100);
 /// Maximum size of a message of a viewer, in bytes.
 const LONGEST: usize = 1 << 20;

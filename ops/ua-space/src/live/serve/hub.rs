@@ -43,6 +43,8 @@ pub(super) struct Client {
     queue: Mutex<Queue>,
     /// Wakes the sender of the connection.
     pub(super) wake: Notify,
+    /// Ends the connection of a viewer that does not read.
+    pub(super) given_up: Notify,
 }
 
 /// The messages that wait for a viewer.
@@ -224,13 +226,11 @@ impl Hub {
             let mut offered = state.offered.values();
             offered.any(|(of, _)| *of == channel)
         };
-        let full = client.queue().subscriptions.len() >= MOST_SUBSCRIPTIONS;
-        match (is_offered, full) {
-            (true, false) => {
-                client.queue().subscriptions.insert(id, channel);
-            }
-            (false, _) => client.refuse(&format!("channel {channel} is not offered")),
-            (true, true) => client.refuse("too many subscriptions"),
+        if !is_offered {
+            return client.refuse(&format!("channel {channel} is not offered"));
+        }
+        if let Err(why) = client.subscribe(id, channel) {
+            client.refuse(&why);
         }
     }
 
@@ -264,21 +264,38 @@ impl Client {
         }
     }
 
-    /// Queues a value for each subscription of its channel. The oldest values give way.
+    /// Adds a subscription.
+    ///
+    /// # Errors
+    /// The reason, if the viewer subscribes to the channel already, as each subscription would get
+    /// a copy of each value, or has too many subscriptions.
+    fn subscribe(&self, id: u32, channel: u16) -> Result<(), String> {
+        let mut queue = self.queue();
+        if queue.subscriptions.values().any(|of| *of == channel) {
+            return Err(format!("channel {channel} is subscribed already"));
+        }
+        if queue.subscriptions.len() >= MOST_SUBSCRIPTIONS {
+            return Err("too many subscriptions".to_owned());
+        }
+        queue.subscriptions.insert(id, channel);
+        Ok(())
+    }
+
+    /// Queues a value if the viewer subscribes to its channel. The oldest values give way.
     fn push(&self, publication: &Publication<'_>) {
         let mut queue = self.queue();
-        let subscriptions = queue.subscriptions.iter();
-        let of = subscriptions.filter(|(_, channel)| **channel == publication.channel);
-        let ids: Vec<u32> = of.map(|(id, _)| *id).collect();
-        for id in &ids {
-            let mut frame = Vec::with_capacity(publication.data.len() + 13);
-            frame.push(MESSAGE_DATA);
-            frame.extend(id.to_le_bytes());
-            frame.extend(publication.time.to_le_bytes());
-            frame.extend(publication.data);
-            queue.weight += frame.len();
-            queue.values.push_back(frame);
-        }
+        let mut subscriptions = queue.subscriptions.iter();
+        let of = subscriptions.find(|(_, channel)| **channel == publication.channel);
+        let Some(id) = of.map(|(id, _)| *id) else {
+            return;
+        };
+        let mut frame = Vec::with_capacity(publication.data.len() + 13);
+        frame.push(MESSAGE_DATA);
+        frame.extend(id.to_le_bytes());
+        frame.extend(publication.time.to_le_bytes());
+        frame.extend(publication.data);
+        queue.weight += frame.len();
+        queue.values.push_back(frame);
         while queue.weight > MOST_WEIGHT || queue.values.len() > MOST_VALUES {
             let Some(oldest) = queue.values.pop_front() else {
                 break;
@@ -286,9 +303,7 @@ impl Client {
             queue.weight -= oldest.len();
             queue.dropped += 1;
         }
-        if !ids.is_empty() {
-            self.wake.notify_one();
-        }
+        self.wake.notify_one();
     }
 
     fn tell(&self, message: &Value) {
@@ -302,9 +317,18 @@ impl Client {
     /// Queues a message of the protocol. A viewer that does not read them is disconnected.
     fn queue_text(&self, text: String) {
         let mut queue = self.queue();
+        if queue.closed {
+            return;
+        }
         queue.control_weight += text.len();
         queue.control.push_back(text);
-        queue.closed |= queue.control_weight > MOST_CONTROL;
+        if queue.control_weight > MOST_CONTROL {
+            *queue = Queue {
+                closed: true,
+                ..Queue::default()
+            };
+            self.given_up.notify_one();
+        }
         self.wake.notify_one();
     }
 
@@ -325,7 +349,8 @@ const MOST_CLIENTS: usize = 32;
 /// alone is dropped.
 const MOST_WEIGHT: usize = 8 << 20;
 const MOST_VALUES: usize = 4096;
-/// Maximum size of the messages of the protocol that wait for a viewer.
+/// Maximum size of the messages of the protocol that wait for a viewer. The descriptions of all
+/// channels are one of them.
 const MOST_CONTROL: usize = 64 << 20;
 const MOST_SUBSCRIPTIONS: usize = 20_000;
 

@@ -29,12 +29,16 @@ pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), 
     };
     // A wrong value is reported before a connection is made.
     let mut block = encode()?;
-    let (client, url) = connect(arguments, &found.urls).await?;
+    // Ctrl-C is caught from here on.
+    let mut pace = Pace::new(arguments)?;
+    let (client, url) = tokio::select! {
+        connected = connect(arguments, &found.urls) => connected?,
+        () = pace.interrupted() => return Err(Failure::Interrupted),
+    };
     let written = async {
         let node = node(&client, found, &url).await?;
         let at = (found.topic, found.described.name.as_str(), "ua-server");
         let mut tally = Tally::default();
-        let mut pace = Pace::new(arguments)?;
         while pace.next().await {
             if tally.written > 0 {
                 block = encode()?;
@@ -276,13 +280,19 @@ fn judged(status: StatusCode) -> Written {
         StatusCode::BadRequestCancelledByRequest => Written::Unknown(
             "BadRequestCancelledByRequest, a newer write replaced the value".to_owned(),
         ),
-        StatusCode::BadNoCommunication | StatusCode::BadShutdown => {
-            Written::Unknown(status.to_string())
-        }
+        // The last four tell of a fault while or after the value was handled.
+        StatusCode::BadNoCommunication
+        | StatusCode::BadShutdown
+        | StatusCode::BadInternalError
+        | StatusCode::BadUnexpectedError
+        | StatusCode::BadDecodingError
+        | StatusCode::BadUnknownResponse => Written::Unknown(status.to_string()),
         StatusCode::BadUserAccessDenied => {
             Written::Refused("BadUserAccessDenied: the user may not write it (--user)".to_owned())
         }
         status if status.is_good() => Written::Arrived,
+        // An uncertain status.
+        status if !status.is_bad() => Written::Unknown(status.to_string()),
         status => Written::Refused(status.to_string()),
     }
 }
@@ -324,6 +334,11 @@ mod tests {
             StatusCode::BadRequestCancelledByRequest,
             StatusCode::BadNoCommunication,
             StatusCode::BadShutdown,
+            StatusCode::BadInternalError,
+            StatusCode::BadUnexpectedError,
+            StatusCode::BadDecodingError,
+            StatusCode::BadUnknownResponse,
+            StatusCode::UncertainLastUsableValue,
             StatusCode::GoodCompletesAsynchronously,
         ] {
             assert!(matches!(judged(status), Written::Unknown(_)), "{status}");

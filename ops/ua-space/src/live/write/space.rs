@@ -26,8 +26,8 @@ use crate::report::warn;
 
 /// Sends the value to the group by the mapping.
 pub(super) fn write(arguments: &Write, mapping: &Path) -> Result<ExitCode, Failure> {
-    if arguments.user.is_some() || arguments.server.is_some() {
-        warn("no ua-server has the value: --user and --server have no effect");
+    if arguments.user.is_some() {
+        warn("no ua-server has the value: --user has no effect");
     }
     let order = Order {
         target: arguments.target.clone(),
@@ -398,9 +398,9 @@ impl Port for WritePort {
         }
         match (self.variable.confirmed_within, self.order.count) {
             (None, _) => self.settle(&Written::Arrived),
-            (Some(_), Some(_)) => self.settle(&Written::Unknown("interrupted".to_owned())),
             // The usual end of a stream. Its last value is not waited for.
-            (Some(_), None) => self.is_open = false,
+            (Some(_), None) if self.tally.written > 0 => self.is_open = false,
+            (Some(_), _) => self.settle(&Written::Unknown("interrupted".to_owned())),
         }
         if self.phase != Phase::Over {
             self.end();
@@ -440,12 +440,13 @@ variables:
             .unwrap_or_else(|| panic!("{:?}", checked.findings))
     }
 
+    /// A rate has no limit of values if its number is 0.
     fn ordered(target: &str, value: &str, rate: Option<(f64, u64)>) -> &'static Order {
         Box::leak(Box::new(Order {
             target: target.parse::<Target>().unwrap(),
             values: vec![value.to_owned()],
             period: rate.map(|(rate, _)| Duration::from_secs_f64(1.0 / rate)),
-            count: Some(rate.map_or(1, |(_, count)| count)),
+            count: Some(rate.map_or(1, |(_, count)| count)).filter(|count| *count > 0),
             json: true,
             topic: OnceLock::new(),
             outcome: Mutex::default(),
@@ -559,6 +560,27 @@ variables:
             wrong.contains("1 of 3 values: a newer value replaced it"),
             "{wrong}"
         );
+    }
+
+    #[tokio::test]
+    async fn an_interrupted_stream_is_unknown_until_a_value_is_written() {
+        for is_confirmed in [false, true] {
+            let order = ordered("Line.Setpoint", "1.5", Some((100.0, 0)));
+            let mut port = port(order);
+            let topic = port.variable.topic;
+            sample(&mut port).await;
+            if is_confirmed {
+                port.settled(topic, &Arrival::Confirmed);
+                sample(&mut port).await;
+            }
+            port.shutdown().await;
+            let ended = outcome(order);
+            assert_eq!(ended.is_ok(), is_confirmed, "{ended:?}");
+            assert!(
+                matches!(ended, Ok(()) | Err(Failure::Unavailable(_))),
+                "{ended:?}"
+            );
+        }
     }
 
     #[tokio::test]

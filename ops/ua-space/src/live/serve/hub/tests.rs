@@ -65,6 +65,42 @@ fn a_viewer_that_does_not_read_loses_its_oldest_values() {
 }
 
 #[test]
+fn a_viewer_subscribes_to_a_channel_once() {
+    let hub = hub();
+    let (_, client) = hub.connect().unwrap();
+    let subscribe =
+        r#"{"op":"subscribe","subscriptions":[{"id":5,"channelId":7},{"id":6,"channelId":7}]}"#;
+    hub.handle(&client, subscribe);
+    let [.., refused] = [text(&client), text(&client), text(&client)];
+    assert_eq!(refused["message"], "channel 7 is subscribed already");
+    published(&hub, 1, 3);
+    assert!(matches!(client.next(), Next::Value(_)));
+    assert_eq!(client.next(), Next::Nothing);
+    hub.handle(&client, r#"{"op":"unsubscribe","subscriptionIds":[5]}"#);
+    hub.handle(&client, subscribe);
+    assert!(hub.is_wanted(7));
+}
+
+#[test]
+fn a_viewer_that_writes_and_does_not_read_is_given_up() {
+    let hub = hub();
+    let (_, client) = hub.connect().unwrap();
+    let long = "x".repeat(1 << 20);
+    for _ in 0..=MOST_CONTROL >> 20 {
+        client.queue_text(long.clone());
+    }
+    assert!(client.queue().closed);
+    client.queue_text(long);
+    let queue = client.queue();
+    assert!(queue.control.is_empty() && queue.control_weight == 0);
+    drop(queue);
+    assert_eq!(client.next(), Next::Closed);
+    // The notice is kept until the connection looks for it.
+    let mut given_up = std::pin::pin!(client.given_up.notified());
+    assert!(given_up.as_mut().enable());
+}
+
+#[test]
 fn a_viewer_cannot_publish_and_the_number_of_viewers_is_limited() {
     let hub = hub();
     let (id, client) = hub.connect().unwrap();
