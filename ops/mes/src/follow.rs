@@ -67,7 +67,7 @@ async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
     };
     let mut again = AGAIN;
     loop {
-        let began = std::time::Instant::now();
+        let began = tokio::time::Instant::now();
         match once(&cell, &seen).await {
             Ok(()) if began.elapsed() > AGAIN_AT_MOST => again = AGAIN,
             Ok(()) => {}
