@@ -20,7 +20,7 @@ use self::packets::Packets;
 use self::sink::Sink;
 use self::values::Values;
 use super::book::{Kind, News};
-use super::channels::is_value;
+use super::channels::{DESCRIBED_WITHIN, is_value};
 use super::list::{FIRST_ASKED, json};
 use super::text::harmless;
 use super::{Go, Incoming, LOOK, Live, in_group, take, until};
@@ -96,6 +96,8 @@ struct Recording {
     slow: u64,
     /// The drops of the kernel before the recording.
     drops_before: u64,
+    /// Whether further messages only describe the values in the recording.
+    is_over: bool,
 }
 
 enum Form {
@@ -123,6 +125,7 @@ impl Recording {
             bytes: 0,
             slow: 0,
             drops_before: own_drops(),
+            is_over: false,
         })
     }
 
@@ -143,7 +146,7 @@ impl Recording {
                 self.flush(now)?;
             }
             if now >= end || self.messages >= most || self.bytes >= most_bytes {
-                return Ok(());
+                return self.await_descriptions(live).await;
             }
             match live.receive(end.min(now + LOOK)).await? {
                 Incoming::Interrupted => return Ok(()),
@@ -152,6 +155,28 @@ impl Recording {
                     self.add(live, (length, from))?;
                 }
             }
+        }
+    }
+
+    /// Waits for the descriptions of recorded values: a short recording ends before their writers
+    /// have responded.
+    async fn await_descriptions(&mut self, live: &mut Live) -> Result<(), Failure> {
+        self.is_over = true;
+        let end = live.now() + DESCRIBED_WITHIN;
+        while self.awaits_descriptions() && live.now() < end {
+            match live.receive(end).await? {
+                Incoming::Interrupted => return Ok(()),
+                Incoming::Nothing => {}
+                Incoming::Message(Received { length, from }) => self.add(live, (length, from))?,
+            }
+        }
+        Ok(())
+    }
+
+    fn awaits_descriptions(&self) -> bool {
+        match &self.form {
+            Form::Packets(_) => false,
+            Form::Values(values) => values.is_waiting(),
         }
     }
 
@@ -164,7 +189,10 @@ impl Recording {
         let time = live.utc(now);
         let datagram = live.buffer.get(..length).unwrap_or_default();
         let read = (&mut live.book, live.sealing.as_mut());
-        self.bytes += u64::try_from(length).unwrap_or_default();
+        let is_over = self.is_over;
+        if !is_over {
+            self.bytes += u64::try_from(length).unwrap_or_default();
+        }
         let (mut added, mut dropped) = (0, 0);
         let mut fault = None;
         match &mut self.form {
@@ -178,7 +206,7 @@ impl Recording {
             Form::Values(values) => {
                 let mut each = |news: News<'_>, now| {
                     let recorded = match &news {
-                        News::Sample(sample) if is_value(&sample.message) => {
+                        News::Sample(sample) if !is_over && is_value(&sample.message) => {
                             values.add(sample, (now, time))
                         }
                         News::Announced(topic, Kind::Value, described, _) => {

@@ -101,6 +101,11 @@ impl Values {
         }
     }
 
+    /// Returns whether values wait for a description.
+    pub(super) fn is_waiting(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
     /// Records the values that have waited too long for a description, without it.
     pub(super) fn give_up_waiting(&mut self, now: Duration) {
         while let Some(first) = self.waiting.front()
