@@ -27,7 +27,13 @@ fn yaml_in(folder: &str) -> Vec<PathBuf> {
 }
 
 /// Pages with YAML of components and of `ua-mes`, which have no schema.
-const WITHOUT_MAPPINGS: [&str; 3] = ["components.md", "plug-and-produce.md", "processes.md"];
+const WITHOUT_MAPPINGS: [&str; 5] = [
+    "components.md",
+    "knowledge.md",
+    "mtp.md",
+    "plug-and-produce.md",
+    "processes.md",
+];
 
 /// Returns the README and the pages of `docs/` that show mappings.
 fn pages() -> Vec<PathBuf> {
