@@ -129,7 +129,10 @@ function tell(name, kind, lines) {
 /** Shows the response of a call, unless it only confirms. */
 function answered(name, answer) {
   announce(`${name} was answered`);
-  const fields = (answer.response ?? []).filter(([, value]) => value !== null && value !== "");
+  const all = (answer.response ?? []).filter(([, value]) => value !== null && value !== "");
+  // The tile shows the run of a skill.
+  const succeeded = all.some(([field, value]) => field === "success" && value === true);
+  const fields = all.filter(([field]) => !(succeeded && field === "run"));
   if (fields.some(([, value]) => value !== true)) tell(name, "plain-text", fields.map(([field, value]) => `${field}: ${rounded(JSON.stringify(value))}`));
 }
 
