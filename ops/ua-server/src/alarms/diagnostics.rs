@@ -80,7 +80,7 @@ pub(super) struct Diagnostics {
 }
 
 impl Diagnostics {
-    /// Forgets the statuses whose condition is not kept.
+    /// Keeps the statuses of these conditions only.
     pub(super) fn retain(&mut self, is_kept: impl Fn(&NodeId) -> bool) {
         self.last.retain(|node, _| is_kept(node));
     }
