@@ -297,13 +297,13 @@ impl Template {
     /// Returns the path and the body with the values of parameters.
     ///
     /// # Errors
-    /// The name of an unknown parameter.
+    /// The name of a parameter that is unknown or does not fit in the path.
     fn filled(&self, parameters: &Parameters) -> Result<(String, Option<Json>), String> {
         let value = |name: &str| {
             let value = parameters.get(name).map(Value::to_json);
             value.ok_or_else(|| format!("{name} is not a parameter of the skill"))
         };
-        let path = fill(&self.path, &|name| Ok(escaped(&plain(&value(name)?))))?;
+        let path = filled_path(&self.path, &value)?;
         let body = self.body.as_ref().map(|body| filled(body, &value));
         Ok((path, body.transpose()?))
     }
@@ -328,6 +328,32 @@ fn fill(text: &str, value: &dyn Fn(&str) -> Result<String, String>) -> Result<St
     }
     out.push_str(rest);
     Ok(out)
+}
+
+/// Fills a path and its query. Values are escaped: each stays within its segment of the path.
+///
+/// # Errors
+/// The name of a parameter that is unknown, or with which a segment is `.` or `..`: servers replace
+/// such segments.
+fn filled_path(
+    template: &str,
+    value: &dyn Fn(&str) -> Result<Json, String>,
+) -> Result<String, String> {
+    let (path, query) = match template.find('?') {
+        Some(at) => template.split_at(at),
+        None => (template, ""),
+    };
+    let part = |text: &str| fill(text, &|name| Ok(escaped(&plain(&value(name)?))));
+    let segment = |template: &str| {
+        let segment = part(template)?;
+        let name = template.split(['{', '}']).nth(1);
+        match name.filter(|_| matches!(&*segment, "." | "..")) {
+            None => Ok(segment),
+            Some(name) => Err(format!("{name}: a segment of the path is `{segment}`")),
+        }
+    };
+    let segments: Vec<String> = path.split('/').map(segment).collect::<Result<_, _>>()?;
+    Ok(segments.join("/") + &part(query)?)
 }
 
 fn filled(json: &Json, value: &dyn Fn(&str) -> Result<Json, String>) -> Result<Json, String> {

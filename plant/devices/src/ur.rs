@@ -22,7 +22,7 @@ use skills::{
 };
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::{Instant, sleep, timeout, timeout_at};
 
 use self::force::Guard;
 pub use self::pose::{of_robot, to_robot};
@@ -379,14 +379,19 @@ impl Motion {
             Ok(program) => {
                 sleep(SETTLED).await;
                 drop(program);
-                "the stop program is sent".to_owned()
+                SENT.to_owned()
             }
-            Err(why) => format!("the stop program is not sent: {why}"),
+            Err(why) => format!("{NOT_SENT}: {why}"),
         };
-        let why = format!("{why}; the outcome is unknown, {stopped}");
-        work.unknown(&why).await;
-        why
+        unknown(work, why, &stopped).await
     }
+}
+
+/// Reports that the robot may move. Returns the reason with what was done.
+async fn unknown(work: &Work, why: &str, stopped: &str) -> String {
+    let why = format!("{why}; the outcome is unknown, {stopped}");
+    work.unknown(&why).await;
+    why
 }
 
 /// The RTDE connection of a run.
@@ -405,8 +410,20 @@ impl Session {
         State::of(&values).ok_or_else(|| "the robot tells values of other types".to_owned())
     }
 
-    async fn slide(&mut self, fraction: f64) -> Result<(), String> {
-        self.rtde.tell(&[Value::U32(1), Value::F64(fraction)]).await
+    /// Sets the speed slider.
+    ///
+    /// # Errors
+    /// The robot does not receive it and may move: the outcome is unknown.
+    async fn slide(
+        &mut self,
+        (motion, work): (&Motion, &Work),
+        fraction: f64,
+    ) -> Result<(), String> {
+        let values = [Value::U32(1), Value::F64(fraction)];
+        match self.rtde.tell(&values).await {
+            Ok(()) => Ok(()),
+            Err(why) => Err(motion.lost(work, &why).await),
+        }
     }
 
     /// Follows the run until the program is done. No future is dropped on the way: the robot sends
@@ -444,18 +461,18 @@ impl Session {
             }
             let can_stand = self.rtde.may_tell();
             match (is(work.stopped()).await, is(work.held()).await, standing) {
-                (true, _, standing) => return Err(self.halt(motion, standing).await?),
+                (true, _, standing) => return Err(self.halt((motion, work), standing).await?),
                 (false, true, None) if !can_stand => {
-                    let halted = self.halt(motion, None).await?;
+                    let halted = self.halt((motion, work), None).await?;
                     return Err(format!("another client has the speed slider: {halted}"));
                 }
                 (false, true, None) => {
                     standing = Some(at.slider);
-                    self.slide(0.0).await?;
+                    self.slide((motion, work), 0.0).await?;
                 }
                 (false, false, Some(slider)) => {
                     standing = None;
-                    self.slide(slider).await?;
+                    self.slide((motion, work), slider).await?;
                 }
                 (false, true, Some(_)) | (false, false, None) => {}
             }
@@ -465,44 +482,66 @@ impl Session {
     /// Brakes at the force limit, and returns the state of the robot after that.
     ///
     /// # Errors
-    /// The robot has not stopped: the outcome is unknown.
+    /// As [`brake`](Self::brake).
     async fn contact(
         &mut self,
         (motion, work): (&Motion, &Work),
         slider: Option<f64>,
         force: &str,
     ) -> Result<State, String> {
-        let at = self.brake(motion, slider).await?;
+        let braked = self.brake((motion, work), slider).await;
         work.note(force).await;
-        if at.speed < STILL {
-            return Ok(at);
-        }
-        let why = format!("{force}, and the robot has not stopped: the outcome is unknown");
-        work.unknown(&why).await;
-        Err(why)
+        braked.map_err(|why| format!("{force}, and {why}"))
     }
 
     /// Brakes, and returns the position of the robot after that as text.
-    async fn halt(&mut self, motion: &Motion, slider: Option<f64>) -> Result<String, String> {
-        let [x, y, z, ..] = self.brake(motion, slider).await?.pose;
+    ///
+    /// # Errors
+    /// As [`brake`](Self::brake).
+    async fn halt(&mut self, of: (&Motion, &Work), slider: Option<f64>) -> Result<String, String> {
+        let [x, y, z, ..] = self.brake(of, slider).await?.pose;
         Ok(format!("stopped at {x:.3}, {y:.3}, {z:.3} m"))
     }
 
-    /// Brakes, and returns the state of the robot after that.
-    async fn brake(&mut self, motion: &Motion, slider: Option<f64>) -> Result<State, String> {
-        let _program = motion.send(HALT).await?;
-        let asked = Instant::now();
-        let at = loop {
-            let at = self.state().await?;
-            let taken = asked.elapsed() > SETTLED;
-            if taken && (at.speed < STILL || asked.elapsed() > BRAKED) {
-                break at;
-            }
+    /// Brakes, and returns the state of the robot after that. `slider` is the position of the speed
+    /// slider before the run was suspended.
+    ///
+    /// # Errors
+    /// The robot may move: the outcome is unknown.
+    async fn brake(
+        &mut self,
+        (motion, work): (&Motion, &Work),
+        slider: Option<f64>,
+    ) -> Result<State, String> {
+        let _program = match motion.send(HALT).await {
+            Ok(program) => program,
+            Err(why) => return Err(unknown(work, &why, NOT_SENT).await),
         };
-        if let Some(slider) = slider {
-            self.slide(slider).await?;
+        let at = self.stand(work).await?;
+        let Some(slider) = slider else {
+            return Ok(at);
+        };
+        // With the slider at zero, the robot stands whether or not it has taken the stop program.
+        self.slide((motion, work), slider).await?;
+        self.stand(work).await
+    }
+
+    /// Returns the state of the robot when it stands after the stop program.
+    ///
+    /// # Errors
+    /// The robot may move: the outcome is unknown.
+    async fn stand(&mut self, work: &Work) -> Result<State, String> {
+        let asked = Instant::now();
+        loop {
+            // The connection is not used after a dropped future.
+            let why = match timeout_at(asked + BRAKED, self.state()).await {
+                Ok(Ok(at)) if asked.elapsed() > SETTLED && at.speed < STILL => return Ok(at),
+                Ok(Ok(_)) => continue,
+                Ok(Err(why)) => why,
+                Err(_) => format!("the robot is not seen to stop within {BRAKED:?}"),
+            };
+            return Err(unknown(work, &why, SENT).await);
         }
-        Ok(at)
     }
 }
 
@@ -544,6 +583,8 @@ async fn is(ready: impl Future<Output = ()>) -> bool {
 
 /// The program that stops the robot along its path.
 const HALT: &str = "def ua_halt():\n  stopl(3.0)\nend\n";
+const SENT: &str = "the stop program is sent";
+const NOT_SENT: &str = "the stop program is not sent";
 /// `runtime_state` of a running program.
 const PLAYING: u32 = 2;
 const HERTZ: f64 = 50.0;

@@ -391,9 +391,12 @@ impl Actor {
     async fn reset(&mut self, by: &Owner) -> Result<(), Refusal> {
         if self.program.state() == State::Suspended {
             // Cancels the suspended work.
-            let _stopped = self.stop_work().await;
+            let mut message = format!("reset by {by} while it was suspended");
+            if let Stop::BrokenOff(how) = self.stop_work().await {
+                message = format!("{message}; {how}");
+            }
             if self.work.is_none() {
-                self.end_without_work(format!("reset by {by} while it was suspended"));
+                self.end_without_work(message);
             }
         }
         if let Some(work) = &mut self.work {
@@ -412,21 +415,12 @@ impl Actor {
         if let Some(work) = &mut self.work {
             work.deadline = None;
         }
+        let message = format!("the work was not done within {within:?}");
         match self.stop_work().await {
             Stop::Done(result) => self.settle(Ok(result)),
-            Stop::Pending | Stop::Refused(_) => {
-                let message = format!("the work was not done within {within:?}");
-                self.await_end(message, Then::End);
-            }
-            Stop::Stopped | Stop::BrokenOff(_) => {
-                let run = self.program.run();
-                let message = format!("the work was not done within {within:?}");
-                self.end_without_work(message.clone());
-                let ended = run.and_then(|run| self.program.ended(run, Ending::Failure).ok());
-                if let Some(transition) = ended {
-                    self.transition(transition, message);
-                }
-            }
+            Stop::Pending | Stop::Refused(_) => self.await_end(message, Then::End),
+            Stop::Stopped => self.fail_without_work(message),
+            Stop::BrokenOff(how) => self.fail_without_work(format!("{message}; {how}")),
         }
     }
 
@@ -445,19 +439,34 @@ impl Actor {
         }
         if let Ok(ended) = timeout(TIME_TO_STOP, &mut work.task).await {
             let ended = outcome_of(ended);
-            self.take_steps();
-            self.work = None;
-            return ended.map_or(Stop::Stopped, Stop::Done);
+            return match (self.end_stopped(), ended) {
+                (_, Ok(results)) => Stop::Done(results),
+                (true, Err(why)) => Stop::BrokenOff(why),
+                (false, Err(_)) => Stop::Stopped,
+            };
         }
         work.task.abort();
         let ended = timeout(TIME_TO_BREAK_OFF, &mut work.task).await;
-        let how =
-            format!("its work had not come to a stand after {TIME_TO_STOP:?} and was broken off");
+        let how = format!(
+            "the outcome is unknown: its work had not come to a stand after {TIME_TO_STOP:?} and was broken off"
+        );
         warn!(skill = self.facts.name, "run {}: {how}", work.run.number());
         if ended.is_ok() {
-            self.work = None;
+            self.end_stopped();
         }
+        // A dropped future does not stop the machine.
+        self.now.needs_reset = true;
         Stop::BrokenOff(how)
+    }
+
+    /// Removes stopped work that has ended. Returns whether its end is unknown; the skill then
+    /// needs a Reset.
+    fn end_stopped(&mut self) -> bool {
+        self.take_steps();
+        let work = self.work.take();
+        let is_unknown = work.is_some_and(|work| work.unknown.is_some());
+        self.now.needs_reset |= is_unknown;
+        is_unknown
     }
 
     /// Waits up to [`TIME_TO_STOP`] for the end of work that is done elsewhere. Such work is never
@@ -486,15 +495,7 @@ impl Actor {
                     }
                 }
                 Happened::Ended(ended) => {
-                    self.take_steps();
-                    if self
-                        .work
-                        .as_ref()
-                        .is_some_and(|work| work.unknown.is_some())
-                    {
-                        self.now.needs_reset = true;
-                    }
-                    self.work = None;
+                    self.end_stopped();
                     return match ended {
                         Ok(results) => Stop::Done(results),
                         Err(why) if why == Stopped.to_string() => Stop::Stopped,
@@ -639,6 +640,16 @@ impl Actor {
         match self.program.ended(run, ending) {
             Ok(transition) => self.transition(transition, message),
             Err(fault) => warn!(skill = self.facts.name, "{fault}"),
+        }
+    }
+
+    /// Fails a run after its work was stopped.
+    fn fail_without_work(&mut self, message: String) {
+        let run = self.program.run();
+        self.end_without_work(message.clone());
+        let ended = run.and_then(|run| self.program.ended(run, Ending::Failure).ok());
+        if let Some(transition) = ended {
+            self.transition(transition, message);
         }
     }
 
@@ -805,7 +816,7 @@ enum Stop {
     Done(Results),
     /// The work stopped.
     Stopped,
-    /// The work did not stop and was aborted.
+    /// The work ended with a reason, or did not stop and was aborted.
     BrokenOff(String),
     /// The work is done elsewhere, and its end is not known yet.
     Pending,

@@ -185,12 +185,13 @@ impl Configuration {
 
     /// Returns the configured period of the measurements of values with these names.
     pub(crate) fn period(&self, names: &[String]) -> Option<Duration> {
+        let values = Arc::clone(&self.values.borrow());
         let periods = self.fields.iter().filter_map(|field| {
             let Effect::Period(of) = &field.effect else {
                 return None;
             };
             let is_meant = of.as_ref().is_none_or(|name| names.contains(name));
-            let ms = self.value(field).filter(|_| is_meant)?.as_f64()?;
+            let ms = field.value_in(&values).filter(|_| is_meant)?.as_f64()?;
             Duration::try_from_secs_f64(ms / 1000.0).ok()
         });
         periods.min()

@@ -30,13 +30,16 @@ fn to(target: [f64; 6]) -> Vec<(String, skills::Value)> {
 }
 
 impl Bench {
-    fn driver(&self, of: &str) -> Arc<dyn Driver> {
-        let settings = Settings {
+    fn settings(&self) -> Settings {
+        Settings {
             rtde: self.serving.rtde().to_string(),
             secondary: self.serving.secondary().to_string(),
             reach: REACH,
-        };
-        Robot::new(settings)
+        }
+    }
+
+    fn driver(&self, of: &str) -> Arc<dyn Driver> {
+        Robot::new(self.settings())
             .driver(&[TypeName::own(of)], &PeerAccess::default())
             .unwrap()
     }
@@ -173,11 +176,7 @@ async fn what_it_cannot_reach_is_refused_before_anything_is_sent() {
 #[tokio::test]
 async fn its_values_follow_the_robot_and_come_back_after_a_silence() {
     let bench = bench().await;
-    let robot: Arc<dyn Device> = Arc::new(Robot::new(Settings {
-        rtde: bench.serving.rtde().to_string(),
-        secondary: bench.serving.secondary().to_string(),
-        reach: REACH,
-    }));
+    let robot: Arc<dyn Device> = Arc::new(Robot::new(bench.settings()));
     let values = crate::sensors::tests::measured(robot);
     let at = |x: f64| {
         move |value: &Result<skills::Value, String>| {
@@ -234,4 +233,66 @@ async fn a_force_move_ends_at_a_contact_and_says_the_force() {
     assert!((0.3..0.446).contains(&position[2]), "{position:?}");
     let [_, _, z, ..] = bench.simulator.pose();
     assert!(z > 0.31, "it stands at {z}");
+}
+
+/// A run that brakes a robot of which another client has the speed slider.
+struct Brakes {
+    settings: Arc<Settings>,
+    robot: Simulator,
+    silent: bool,
+}
+
+#[async_trait]
+impl Driver for Brakes {
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let motion = Motion {
+            settings: Arc::clone(&self.settings),
+            linear: true,
+            guarded: false,
+        };
+        let _other = Session::open(&self.settings, HERTZ).await?;
+        let mut session = Session::open(&self.settings, HERTZ).await?;
+        self.robot.set_silent(self.silent);
+        session.brake((&motion, &work), Some(1.0)).await?;
+        Ok(Vec::new())
+    }
+}
+
+#[tokio::test]
+async fn a_robot_that_is_lost_while_it_brakes_is_unknown() {
+    for (silent, is_there, why) in [
+        (
+            true,
+            true,
+            "is not seen to stop within 700ms; the outcome is unknown, the stop program is sent",
+        ),
+        (
+            false,
+            true,
+            "tells it that already; the outcome is unknown, the stop program is sent",
+        ),
+        (
+            false,
+            false,
+            "; the outcome is unknown, the stop program is not sent",
+        ),
+    ] {
+        let bench = bench().await;
+        let mut settings = bench.settings();
+        if !is_there {
+            settings.secondary = "127.0.0.1:1".to_owned();
+        }
+        let driver = Arc::new(Brakes {
+            settings: Arc::new(settings),
+            robot: bench.simulator.clone(),
+            silent,
+        });
+        let target = to([0.4, 0.1, 0.4, 0.0, 0.0, 0.0]);
+        let outcome = conformance::run_once("LinearMoveSkillType", driver, target)
+            .await
+            .unwrap();
+        assert!(outcome.message.ends_with(why), "{}", outcome.message);
+        let told = outcome.trace.iter().any(|line| line.ends_with(why));
+        assert!(told, "{:?}", outcome.trace);
+    }
 }

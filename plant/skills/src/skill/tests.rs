@@ -30,6 +30,8 @@ enum How {
     Fails,
     /// Neither ends nor reacts to the stop signal.
     Deaf,
+    /// Ends when it is stopped, and reports that its end is unknown.
+    Lost,
     /// Blocks its thread.
     Blocks(Duration),
     /// Is done elsewhere and reports this when it is stopped. It ends as stopped at the next
@@ -55,9 +57,13 @@ impl Driver for Scripted {
         match self.how {
             How::Elsewhere(Elsewhere::NeverEnds) => Some(Duration::ZERO),
             How::Elsewhere(_) => Some(HALT_TIMEOUT),
-            How::AtOnce | How::WhenLet | How::Panics | How::Fails | How::Deaf | How::Blocks(_) => {
-                None
-            }
+            How::AtOnce
+            | How::WhenLet
+            | How::Panics
+            | How::Fails
+            | How::Deaf
+            | How::Lost
+            | How::Blocks(_) => None,
         }
     }
 
@@ -74,6 +80,11 @@ impl Driver for Scripted {
             How::Panics => panic!("a wire is loose"),
             How::Fails => return Err("nothing is there".to_owned()),
             How::Deaf => std::future::pending().await,
+            How::Lost => {
+                work.stopped().await;
+                work.unknown("the robot is lost").await;
+                return Err("the robot is lost".to_owned());
+            }
             How::Blocks(time) => block(time),
             How::Elsewhere(how) => {
                 work.stopped().await;
@@ -528,6 +539,43 @@ async fn a_driver_that_does_not_hear_is_broken_off() {
     assert!(message.ends_with("was broken off"), "{message}");
     bench.call(Method::Reset).await.unwrap();
     assert_eq!(bench.call(Method::Start).await, Ok(2));
+}
+
+#[tokio::test]
+async fn stopped_work_without_a_known_end_needs_a_reset() {
+    let limit = Some(Duration::from_millis(20));
+    for (how, limit, why) in [
+        (How::Lost, None, "halted by session 1; the robot is lost"),
+        (
+            How::Deaf,
+            None,
+            "halted by session 1; the outcome is unknown: its work had not come to a stand after 1s and was broken off",
+        ),
+        (
+            How::Lost,
+            limit,
+            "the work was not done within 20ms; the robot is lost",
+        ),
+        (
+            How::Deaf,
+            limit,
+            "the work was not done within 20ms; the outcome is unknown: its work had not come to a stand after 1s and was broken off",
+        ),
+    ] {
+        let bench = bench_of(how, "GraspSkillType", limit);
+        bench.run_to(State::Running).await;
+        if limit.is_none() {
+            bench.call(Method::Halt).await.unwrap();
+        }
+        let shown = bench.until(State::Halted).await;
+        assert!(shown.needs_reset);
+        assert_eq!(bench.skill.outcome(1).unwrap().message, why);
+        let refused = bench.skill.execute(ME, Vec::new(), None).await.unwrap_err();
+        assert_eq!(refused.code, Code::InvalidState, "{refused}");
+        bench.call(Method::Reset).await.unwrap();
+        assert!(!bench.skill.shown().needs_reset);
+        assert_eq!(bench.skill.execute(ME, Vec::new(), None).await, Ok(2));
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
