@@ -11,6 +11,7 @@ use skills::{
     GripPoint, Outcome, PartEnd, PickAndPlace, Runs, SkillFault, Teller, Value, run_part,
 };
 use tokio::sync::watch;
+use tokio::time::Instant;
 use tracing::{info, warn};
 
 use crate::plan::{Fallen, Offer, Plan, plan};
@@ -84,12 +85,24 @@ pub(crate) async fn execute(
     }
     .run()
     .await;
+    let ended = match ended {
+        Err(why) if log.run().is_unknown() => {
+            let why = match is_unknown(&why) {
+                true => why,
+                false => format!("{why}; the outcome is unknown"),
+            };
+            // Nobody starts the process again before a Reset.
+            teller.unknown(&why).await;
+            Err(why)
+        }
+        Ok(()) | Err(_) => ended,
+    };
     log.change(|kept, now| {
         kept.run.ended_ms = Some(now);
         kept.run.waits_for = None;
         (kept.run.outcome, kept.run.reason) = match ended {
             Ok(()) => (How::Done, None),
-            Err(why) => (How::Failed, Some(why)),
+            Err(why) => (ended_badly(&kept.run), Some(why)),
         };
     });
     let run = log.run();
@@ -113,9 +126,17 @@ impl Drop for Whole {
             }
             kept.run.ended_ms = Some(now);
             kept.run.waits_for = None;
-            kept.run.outcome = How::Failed;
+            kept.run.outcome = ended_badly(&kept.run);
             kept.run.reason = Some(why.to_owned());
         });
+    }
+}
+
+/// Returns the outcome of a run that is not done.
+fn ended_badly(run: &Run) -> How {
+    match run.is_unknown() {
+        true => How::Unknown,
+        false => How::Failed,
     }
 }
 
@@ -123,7 +144,13 @@ fn tell(run: &Run) {
     let (plans, process) = (run.plans.len(), &run.process);
     match &run.reason {
         None => info!(process, run = run.run, plans, "a process is done"),
-        Some(reason) => warn!(process, run = run.run, "a process failed: {reason}"),
+        Some(reason) => {
+            let what = match run.is_unknown() {
+                true => "the outcome of a process is unknown",
+                false => "a process failed",
+            };
+            warn!(process, run = run.run, "{what}: {reason}");
+        }
     }
 }
 
@@ -185,6 +212,8 @@ impl Execution<'_> {
             match ended {
                 Ended::Done => return Ok(()),
                 Ended::Over(why) => return Err(why),
+                // The step whose end is unknown may go on; no other component repeats it.
+                Ended::Broken(why) if self.log.run().is_unknown() => return Err(why),
                 Ended::Broken(why) => {
                     warn!(plan = number, "a plan broke: {why}");
                     last = why;
@@ -359,7 +388,7 @@ impl Execution<'_> {
                 }
             };
             // The run of a lost component may go on; another component must not repeat it.
-            let goes_on = matches!(outcome, Err(SkillFault::NotHalted(_) | SkillFault::Lost(_)));
+            let is_lost = matches!(outcome, Err(SkillFault::Lost(_)));
             let why = match outcome {
                 Ok(outcome) if outcome.succeeded => continue,
                 Ok(outcome) => outcome.message,
@@ -368,7 +397,7 @@ impl Execution<'_> {
             // Another plan would repeat the completed steps.
             let why = format!("{}: {} {why}", step.name, skill.name());
             let is_first = self.process.steps.first() == Some(step);
-            return if is_first && !goes_on {
+            return if is_first && !is_lost {
                 Ended::Broken(why)
             } else {
                 Ended::Over(why)
@@ -495,18 +524,23 @@ impl Watched {
 
     fn ends(&self, outcome: How, reason: Option<String>, results: Values) {
         self.log.change(|kept, now| {
-            let is_this = |ran: &&mut Ran| ran.ended_ms.is_none() && ran.skill == self.offer.skill;
+            let is_this = |ran: &&mut Ran| ran.is_running() && ran.skill == self.offer.skill;
             if let Some(ran) = kept
                 .run
                 .plan()
                 .and_then(|plan| plan.ran.iter_mut().rev().find(is_this))
             {
-                ran.ended_ms = Some(now);
+                ran.ended_ms = (outcome != How::Unknown).then_some(now);
                 ran.outcome = outcome;
                 ran.reason = reason;
                 ran.results = results;
             }
         });
+    }
+
+    /// Records that the end of the run is unknown.
+    fn unknown(&self, why: &str) {
+        self.ends(How::Unknown, Some(why.to_owned()), Values::new());
     }
 
     fn fell(&self, is_lost: bool, why: &str) {
@@ -542,11 +576,13 @@ impl Runs for Watched {
     ) -> Result<Outcome, SkillFault> {
         self.is_halted.store(false, Ordering::Relaxed);
         self.begins(recorded(&parameters));
+        let began = Instant::now();
         let outcome = self.inner.run(parameters, within).await;
         match &outcome {
             Ok(outcome) if outcome.succeeded => {
                 self.ends(How::Done, None, recorded(&outcome.results));
             }
+            Ok(outcome) if is_unknown(&outcome.message) => self.unknown(&outcome.message),
             Ok(_) if self.is_halted.load(Ordering::Relaxed) => {
                 self.ends(How::Stopped, None, Values::new());
             }
@@ -555,6 +591,9 @@ impl Runs for Watched {
                 self.ends(How::Failed, Some(outcome.message.clone()), Values::new());
             }
             Err(SkillFault::Lost(why)) => self.fell(true, why),
+            Err(fault) if may_go_on(fault, began.elapsed() >= within) => {
+                self.unknown(&fault.to_string());
+            }
             Err(fault) => {
                 self.fell(false, &fault.to_string());
                 self.ends(How::Failed, Some(fault.to_string()), Values::new());
@@ -572,6 +611,33 @@ impl Runs for Watched {
         let why = self.inner.lost().await;
         self.fell(true, &why);
         why
+    }
+}
+
+/// Returns whether a message of a skill says that the end of its run is unknown. The outcome of a
+/// skill has no other place for it.
+fn is_unknown(message: &str) -> bool {
+    let message = message.to_lowercase();
+    [
+        "is unknown",
+        "is not known",
+        "is lost: ",
+        "may go on",
+        "needs a reset",
+    ]
+    .iter()
+    .any(|said| message.contains(said))
+}
+
+/// Returns whether a run may go on after a fault. `is_late` tells that the time of the run was
+/// over, when a refusal can be that of its Halt.
+const fn may_go_on(fault: &SkillFault, is_late: bool) -> bool {
+    match fault {
+        // The run may have been started, and its end was not seen.
+        SkillFault::NotHalted(_) | SkillFault::Lost(_) | SkillFault::Unexpected(_) => true,
+        SkillFault::Refused { .. } => is_late,
+        // The Halt was confirmed.
+        SkillFault::TimedOut(_) => false,
     }
 }
 

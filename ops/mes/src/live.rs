@@ -1,6 +1,6 @@
 //! The current states of skills and of the services of connected modules, as statements.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,7 +10,9 @@ use mtp::{Object, Triple};
 use plant_opcua::client::{Client, ClientConfig, Notice, Watch};
 use plant_opcua::types::{NodeId, Variant};
 use skills::{ClientOptions, FoundSkill, SkillClient, from_variant};
-use tracing::{debug, error, info};
+use tokio::task::{Id, JoinSet};
+use tokio::time::Instant;
+use tracing::{debug, error, info, warn};
 
 use crate::cell::now;
 
@@ -102,36 +104,116 @@ pub(crate) struct WatchedModule {
 struct Watched {
     /// The IRIs of its procedures.
     skills: Vec<String>,
+    /// The endpoint of the server that shows its state.
     endpoint: String,
     state: Option<NodeName>,
     commands: Option<NodeName>,
+    commands_endpoint: String,
     /// The current words.
     state_word: Option<u32>,
     commands_word: Option<u32>,
 }
 
-/// Publishes the states of the services of a module whenever the module can be reached.
+/// Publishes the states of the services of a module whenever its servers can be reached. Each
+/// endpoint has a connection.
 pub(crate) async fn module(
     knowledge: Arc<Knowledge>,
     options: ClientOptions,
     module: WatchedModule,
 ) {
-    let source = Source::new(SourceKind::State, &module.name);
     let mut changes = knowledge.changes();
+    let mut pauses: BTreeMap<String, Duration> = BTreeMap::new();
+    let mut connections = JoinSet::new();
+    let mut connected: HashMap<Id, String> = HashMap::new();
+    let mut is_told = false;
     loop {
         changes.borrow_and_update();
-        let mut services = services(&knowledge, &module.iri);
-        let endpoint = module.endpoint.clone().or_else(|| {
-            let mut known = services.values();
-            known.next().map(|service| service.endpoint.clone())
-        });
-        let Some(endpoint) = endpoint else {
-            // The manifest is not in the graph.
-            if changes.changed().await.is_err() {
-                return;
+        let services = services(&knowledge, &module.iri);
+        let mut all = by_endpoint(services, module.endpoint.as_deref());
+        if let Some(services) = all.remove("")
+            && !std::mem::replace(&mut is_told, true)
+        {
+            let (module, services) = (&module.name, services.len());
+            warn!(
+                module,
+                services, "services without an endpoint are not watched"
+            );
+        }
+        let has_one = all.len() == 1;
+        for (endpoint, services) in all {
+            if connected.values().any(|known| *known == endpoint) {
+                continue;
             }
-            continue;
-        };
+            let name = match has_one {
+                true => module.name.clone(),
+                false => format!("{} {endpoint}", module.name),
+            };
+            let connection = Connection {
+                knowledge: Arc::clone(&knowledge),
+                source: Source::new(SourceKind::State, &name),
+                module: module.name.clone(),
+                endpoint: endpoint.clone(),
+                pause: pauses.get(&endpoint).copied().unwrap_or(AGAIN),
+            };
+            let task = connections.spawn(connection.once(options.clone(), services));
+            connected.insert(task.id(), endpoint);
+        }
+        tokio::select! {
+            Some(ended) = connections.join_next_with_id() => {
+                let (id, pause) = match ended {
+                    Ok((id, pause)) => (id, pause),
+                    Err(fault) => (fault.id(), AGAIN_AT_MOST),
+                };
+                if let Some(endpoint) = connected.remove(&id) {
+                    pauses.insert(endpoint, pause);
+                }
+            }
+            // The manifest is not in the graph.
+            changed = changes.changed(), if connections.is_empty() => {
+                if changed.is_err() {
+                    return;
+                }
+            }
+        }
+    }
+}
+
+/// Returns the services by the endpoints of their servers, which may be empty. With `instead`, all
+/// are at this endpoint.
+fn by_endpoint(
+    services: BTreeMap<String, Watched>,
+    instead: Option<&str>,
+) -> BTreeMap<String, BTreeMap<String, Watched>> {
+    let mut all: BTreeMap<String, BTreeMap<String, Watched>> = BTreeMap::new();
+    for (iri, mut service) in services {
+        let endpoint = instead.unwrap_or(&service.endpoint).to_owned();
+        if instead.is_none() && service.commands_endpoint != endpoint {
+            // The word is at another server.
+            service.commands = None;
+        }
+        all.entry(endpoint).or_default().insert(iri, service);
+    }
+    all
+}
+
+/// A connection to a server of a module.
+struct Connection {
+    knowledge: Arc<Knowledge>,
+    source: Source,
+    module: String,
+    endpoint: String,
+    /// Pause before the next connection.
+    pause: Duration,
+}
+
+impl Connection {
+    /// Publishes the states of the services of the server once, until the connection is lost, and
+    /// waits before the next time. Returns the next pause.
+    async fn once(
+        self,
+        options: ClientOptions,
+        mut services: BTreeMap<String, Watched>,
+    ) -> Duration {
         let config = ClientConfig {
             pki: options.pki.clone(),
             user: options.user.clone(),
@@ -139,35 +221,43 @@ pub(crate) async fn module(
             timeout: options.within,
             ..ClientConfig::new(&options.application_uri, &options.application_name)
         };
-        let client = Client::open(config, &endpoint);
-        if client.up(CONNECTS).await.is_ok() {
-            let forgotten = Forgotten {
-                knowledge: &knowledge,
-                source: &source,
-            };
-            connected(
-                &forgotten,
-                &client,
-                (&module.name, &endpoint),
-                &mut services,
-            )
-            .await;
-        }
+        let client = Client::open(config, &self.endpoint);
+        let lasted = match client.up(CONNECTS).await {
+            Ok(()) => {
+                let began = Instant::now();
+                self.connected(&client, &mut services).await;
+                Some(began.elapsed())
+            }
+            Err(_) => None,
+        };
         client.close().await;
-        tokio::time::sleep(AGAIN).await;
+        let (now, next) = pauses(self.pause, lasted);
+        tokio::time::sleep(now).await;
+        next
+    }
+
+    /// Publishes the states of services until the connection is lost.
+    async fn connected(&self, client: &Client, services: &mut BTreeMap<String, Watched>) {
+        let _forgotten = Forgotten {
+            knowledge: &self.knowledge,
+            source: &self.source,
+        };
+        let (module, endpoint) = (&self.module, &self.endpoint);
+        info!(module, endpoint, "a module is connected");
+        watch(&self.knowledge, client, &self.source, services).await;
+        info!(module, endpoint, "a module is disconnected");
     }
 }
 
-/// Publishes the states of services of a module until the connection is lost.
-async fn connected(
-    to: &Forgotten<'_>,
-    client: &Client,
-    (module, endpoint): (&str, &str),
-    services: &mut BTreeMap<String, Watched>,
-) {
-    info!(module, endpoint, "a module is connected");
-    watch(to.knowledge, client, to.source, services).await;
-    info!(module, endpoint, "a module is disconnected");
+/// Returns the pause after a connection that lasted so long, and the pause after the next one. The
+/// pauses of a module that accepts connections and drops them grow.
+fn pauses(pause: Duration, lasted: Option<Duration>) -> (Duration, Duration) {
+    match lasted {
+        // The time until the connection fails is a pause too, and nothing is logged.
+        None => (AGAIN, pause),
+        Some(lasted) if lasted > AGAIN_AT_MOST => (AGAIN, AGAIN),
+        Some(_) => (pause, (pause * 2).min(AGAIN_AT_MOST)),
+    }
 }
 
 /// Returns the services of a module by their IRIs.
@@ -199,6 +289,7 @@ fn services(knowledge: &Knowledge, module: &str) -> BTreeMap<String, Watched> {
         if let Some(service) = of.strip_suffix("/node/CommandEnabled")
             && let Some(watched) = services.get_mut(service)
         {
+            Answer::text(&row, "endpoint").clone_into(&mut watched.commands_endpoint);
             watched.commands = node_name(Answer::text(&row, "node"));
         }
     }
@@ -217,6 +308,28 @@ fn node_name(id: &str) -> Option<NodeName> {
     NodeName::parse(id)
 }
 
+/// Returns the nodes of services to watch; for each, the service and whether the node is its state.
+fn watches(
+    client: &Client,
+    services: &BTreeMap<String, Watched>,
+) -> (Vec<Watch>, Vec<(String, bool)>) {
+    let mut watches = Vec::new();
+    let mut of = Vec::new();
+    for (iri, service) in services {
+        for (node, is_state) in [(&service.state, true), (&service.commands, false)] {
+            let Some(node) = node else { continue };
+            let Some(id) = node_id(client, node) else {
+                let namespace = &node.namespace;
+                info!(service = iri, namespace, "the server has no such namespace");
+                continue;
+            };
+            watches.push(Watch::Value(id));
+            of.push((iri.clone(), is_state));
+        }
+    }
+    (watches, of)
+}
+
 /// Publishes the states of services until the connection is lost.
 async fn watch(
     knowledge: &Knowledge,
@@ -224,16 +337,7 @@ async fn watch(
     source: &Source,
     services: &mut BTreeMap<String, Watched>,
 ) {
-    let mut watches = Vec::new();
-    let mut of: Vec<(String, bool)> = Vec::new();
-    for (iri, service) in services.iter() {
-        for (node, is_state) in [(&service.state, true), (&service.commands, false)] {
-            if let Some(node) = node.as_ref().and_then(|node| node_id(client, node)) {
-                watches.push(Watch::Value(node));
-                of.push((iri.clone(), is_state));
-            }
-        }
-    }
+    let (watches, of) = watches(client, services);
     let mut subscription = client.subscribe(watches, INTERVAL, QUEUE);
     let mut link = client.link();
     let is_down =
@@ -338,6 +442,173 @@ const PROGRAM_STATES: &str = "urn:ua-bridge:program-state:";
 const CONNECTS: Duration = Duration::from_secs(5);
 /// Pause before the next connection.
 const AGAIN: Duration = Duration::from_secs(1);
+const AGAIN_AT_MOST: Duration = Duration::from_secs(30);
 /// Publishing interval of the states of services.
 const INTERVAL: Duration = Duration::from_millis(50);
 const QUEUE: usize = 1024;
+
+#[cfg(test)]
+mod tests {
+    use plant_opcua::server::{Server, ServerBuilder, ServerConfig, VariableSpec};
+    use plant_opcua::types::{
+        DataTypeId, DataValue, LocalizedText, ObjectId, QualifiedName, ReferenceTypeId,
+        VariableTypeId,
+    };
+
+    use super::*;
+
+    const STAGE: &str = include_str!("../../../tests/data/mtp/stage.aml");
+
+    /// The manifest of the tests, with the nodes of the service Solo at a server of its own.
+    fn with_two_servers() -> String {
+        let mut own = String::new();
+        let mut rest = String::new();
+        for line in STAGE.lines() {
+            let is_own = line.starts_with("<ExternalInterface Name=\"Solo_");
+            let to = if is_own { &mut own } else { &mut rest };
+            to.push_str(line);
+            to.push('\n');
+        }
+        let server = "<InternalElement Name=\"Server\"";
+        let second = format!(
+            "<InternalElement Name=\"Second\" ID=\"second\" \
+             RefBaseSystemUnitPath=\"MTPCommunicationSUCLib/ServerAssembly/OPCUAServer\">\n\
+             <Attribute Name=\"Endpoint\" AttributeDataType=\"xs:string\">\
+             <Value>opc.tcp://127.0.0.1:4841</Value></Attribute>\n{own}</InternalElement>\n{server}"
+        );
+        assert!(!own.is_empty());
+        rest.replacen(server, &second, 1)
+    }
+
+    fn services_of(manifest: &str) -> BTreeMap<String, Watched> {
+        let module = mtp::Module::from_bytes(manifest.as_bytes()).unwrap();
+        let triples = module.triples("urn:m", &BTreeMap::new());
+        let knowledge = Knowledge::new().unwrap();
+        let source = Source::new(SourceKind::Mtp, "stage");
+        knowledge.replace(&source, &triples, 1).unwrap();
+        services(&knowledge, "urn:m")
+    }
+
+    /// Returns the numbers of services and of their nodes by endpoint.
+    fn counted(all: &BTreeMap<String, BTreeMap<String, Watched>>) -> Vec<(&str, usize, usize)> {
+        let nodes =
+            |one: &Watched| usize::from(one.state.is_some()) + usize::from(one.commands.is_some());
+        all.iter()
+            .map(|(endpoint, services)| {
+                let nodes = services.values().map(nodes).sum();
+                (endpoint.as_str(), services.len(), nodes)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn each_server_of_a_module_has_its_services() {
+        const FIRST: &str = "opc.tcp://127.0.0.1:4840";
+        let one = by_endpoint(services_of(STAGE), None);
+        assert_eq!(counted(&one), [(FIRST, 2, 4)]);
+        let services = services_of(&with_two_servers());
+        let two = by_endpoint(services.clone(), None);
+        let second = ("opc.tcp://127.0.0.1:4841", 1, 2);
+        assert_eq!(counted(&two), [(FIRST, 1, 2), second]);
+        let instead = by_endpoint(services, Some("opc.tcp://h:1"));
+        assert_eq!(counted(&instead), [("opc.tcp://h:1", 2, 4)]);
+        let without = BTreeMap::from([("urn:m/service/1".to_owned(), Watched::default())]);
+        assert_eq!(counted(&by_endpoint(without, None)), [("", 1, 0)]);
+    }
+
+    /// Starts a server that shows the state of a service.
+    fn serves(service: &str, state: ServiceState) -> Server {
+        const NAMESPACE: &str = "urn:ua-bridge:test:stage";
+        let uri = format!("urn:test:{service}");
+        let config = ServerConfig::new(&uri, service, "opc.tcp://127.0.0.1:0".parse().unwrap());
+        let server = ServerBuilder::new(config)
+            .namespace(NAMESPACE)
+            .build()
+            .unwrap();
+        let index = server.namespace(NAMESPACE).unwrap();
+        let name = format!("{service}.StateCur");
+        let variable = VariableSpec {
+            node_id: NodeId::new(index, name.clone()),
+            browse_name: QualifiedName::new(index, name.as_str()),
+            display_name: LocalizedText::from(name.as_str()),
+            type_definition: VariableTypeId::BaseDataVariableType.into(),
+            parent: ObjectId::ObjectsFolder.into(),
+            reference: ReferenceTypeId::Organizes.into(),
+            data_type: DataTypeId::UInt32.into(),
+            value_rank: -1,
+            value: DataValue::new_now(Variant::UInt32(state.bit())),
+            writable: false,
+        };
+        server.add_variable(&variable).unwrap();
+        server.start();
+        server
+    }
+
+    #[tokio::test]
+    async fn the_states_of_a_module_with_two_servers_are_those_of_both() {
+        let solo = serves("Solo", ServiceState::Completed);
+        let duet = serves("Duet", ServiceState::Idle);
+        let manifest = with_two_servers()
+            .replace("opc.tcp://127.0.0.1:4841", solo.url())
+            .replace("opc.tcp://127.0.0.1:4840", duet.url());
+        let manifest = mtp::Module::from_bytes(manifest.as_bytes()).unwrap();
+        let triples = manifest.triples("urn:m", &BTreeMap::new());
+        let knowledge = Arc::new(Knowledge::new().unwrap());
+        let source = Source::new(SourceKind::Mtp, "stage");
+        knowledge.replace(&source, &triples, 1).unwrap();
+        let watched = WatchedModule {
+            name: "stage".to_owned(),
+            iri: "urn:m".to_owned(),
+            endpoint: None,
+        };
+        let states = || {
+            let rows = knowledge.ask("state-of", &[]).unwrap().rows;
+            let known = rows.iter().map(|row| {
+                let (service, _) = Answer::text(row, "skill_name").split_once('/').unwrap();
+                (service.to_owned(), Answer::text(row, "state").to_owned())
+            });
+            let known: BTreeMap<_, _> = known.filter(|(_, state)| !state.is_empty()).collect();
+            known
+        };
+        let until = async |wanted: &[(&str, &str)]| {
+            let wanted = wanted
+                .iter()
+                .map(|(service, state)| ((*service).to_owned(), (*state).to_owned()))
+                .collect();
+            let mut changes = knowledge.changes();
+            let known = async {
+                while states() != wanted {
+                    changes.changed().await.unwrap();
+                }
+            };
+            let in_time = tokio::time::timeout(Duration::from_secs(20), known).await;
+            assert!(in_time.is_ok(), "{:?}", states());
+        };
+        let options = ClientOptions::default();
+        let task = tokio::spawn(module(Arc::clone(&knowledge), options, watched));
+        let idle = ("Duet", "Idle");
+        until(&[idle, ("Solo", "Completed")]).await;
+        // The loss of one server leaves the states of the other.
+        solo.stop().await;
+        until(&[idle]).await;
+        task.abort();
+        assert!(task.await.unwrap_err().is_cancelled());
+        until(&[]).await;
+        duet.stop().await;
+    }
+
+    #[test]
+    fn the_pauses_of_a_module_that_drops_its_connections_grow() {
+        let mut pause = AGAIN;
+        let mut waited = Vec::new();
+        for _ in 0..7 {
+            let (now, next) = pauses(pause, Some(Duration::from_millis(3)));
+            waited.push(now.as_secs());
+            pause = next;
+        }
+        assert_eq!(waited, [1, 2, 4, 8, 16, 30, 30]);
+        assert_eq!(pauses(pause, None), (AGAIN, AGAIN_AT_MOST));
+        let long = Some(Duration::from_secs(60));
+        assert_eq!(pauses(pause, long), (AGAIN, AGAIN));
+    }
+}

@@ -23,6 +23,8 @@ pub(crate) enum How {
     Lost,
     /// It was halted for another reason.
     Stopped,
+    /// Its end is not confirmed: it may go on.
+    Unknown,
 }
 
 /// A run of a process. Times are in ms since 1970.
@@ -69,6 +71,7 @@ pub(crate) struct Ran {
     /// The results that it returned.
     pub(crate) results: Values,
     pub(crate) started_ms: u64,
+    /// `None` while it is running, and if its end is unknown.
     pub(crate) ended_ms: Option<u64>,
     pub(crate) outcome: How,
     pub(crate) reason: Option<String>,
@@ -195,24 +198,42 @@ impl Run {
     pub(crate) fn plan(&mut self) -> Option<&mut Planned> {
         self.plans.last_mut()
     }
+
+    /// Returns whether the end of a skill is unknown.
+    pub(crate) fn is_unknown(&self) -> bool {
+        self.plans.iter().any(Planned::is_unknown)
+    }
+}
+
+impl Ran {
+    pub(crate) fn is_running(&self) -> bool {
+        self.outcome == How::Running
+    }
 }
 
 impl Planned {
-    /// Ends the plan. Skills that are still running are recorded as stopped.
+    /// Ends the plan. The ends of skills that are still running are unknown. The outcome of a plan
+    /// with such a skill is unknown, unless the plan is done.
     pub(crate) fn end(&mut self, at: u64, outcome: How, reason: Option<String>) {
-        self.ended_ms = Some(at);
-        self.outcome = outcome;
-        self.reason = reason;
-        for ran in self.ran.iter_mut().filter(|ran| ran.ended_ms.is_none()) {
-            ran.ended_ms = Some(at);
-            ran.outcome = How::Stopped;
+        for ran in self.ran.iter_mut().filter(|ran| ran.is_running()) {
+            ran.outcome = How::Unknown;
+            ran.reason = Some("the plan ended before it".to_owned());
         }
+        self.ended_ms = Some(at);
+        self.outcome = match outcome == How::Failed && self.is_unknown() {
+            true => How::Unknown,
+            false => outcome,
+        };
+        self.reason = reason;
+    }
+
+    fn is_unknown(&self) -> bool {
+        self.ran.iter().any(|ran| ran.outcome == How::Unknown)
     }
 
     /// Records the loss of a component: its running skills end as lost.
     pub(crate) fn lost(&mut self, at: u64, fallen: &Fallen) {
-        let of_component =
-            |ran: &&mut Ran| ran.ended_ms.is_none() && ran.component == fallen.component;
+        let of_component = |ran: &&mut Ran| ran.is_running() && ran.component == fallen.component;
         for ran in self.ran.iter_mut().filter(of_component) {
             ran.ended_ms = Some(at);
             ran.outcome = How::Lost;
@@ -269,10 +290,14 @@ impl Graph {
         for predicate in [v::STARTED, v::PROV_STARTED_AT_TIME] {
             self.say(what, predicate, Object::Time(date_time(started)));
         }
+        // PROV has no time at which an activity was given up or its component was lost.
+        let is_confirmed = !matches!(outcome, How::Lost | How::Unknown);
         if let Some(ended) = ended {
-            for predicate in [v::ENDED, v::PROV_ENDED_AT_TIME] {
-                self.say(what, predicate, Object::Time(date_time(ended)));
+            let ended = Object::Time(date_time(ended));
+            if is_confirmed {
+                self.say(what, v::PROV_ENDED_AT_TIME, ended.clone());
             }
+            self.say(what, v::ENDED, ended);
         }
         let outcome = match outcome {
             How::Running => "running",
@@ -280,6 +305,7 @@ impl Graph {
             How::Failed => "failed",
             How::Lost => "lost",
             How::Stopped => "stopped",
+            How::Unknown => "unknown",
         };
         self.say(what, v::OUTCOME, Object::Text(outcome.to_owned()));
         if let Some(reason) = reason {

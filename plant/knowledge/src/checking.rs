@@ -55,11 +55,12 @@ impl Site {
             match tokio::time::timeout_at(end, running).await {
                 Ok(Ok(Results::Written(_, rows))) => {
                     size += rows.len();
-                    let rows = rows_of(&rows).map_err(failed)?;
-                    size += rows.len() * size_of_each(&check);
-                    report
-                        .violations
-                        .extend(rows.into_iter().filter_map(|row| violation(&check, row)));
+                    let each = size_of_each(&check);
+                    let reading = tokio::task::spawn_blocking(move || violations_in(&check, &rows));
+                    let read = reading.await.map_err(|error| failed(error.to_string()))?;
+                    let found = read.map_err(failed)?;
+                    size += found.len() * each;
+                    report.violations.extend(found);
                 }
                 Ok(Ok(_)) => {}
                 Ok(Err(fault @ QueryFault::Busy(_))) => return Err(fault.into()),
@@ -134,9 +135,11 @@ struct Found {
     language: Option<String>,
 }
 
-fn rows_of(json: &[u8]) -> Result<Vec<Row>, String> {
+/// Reads the violations of a constraint, which takes long for a large result.
+fn violations_in(check: &Check, json: &[u8]) -> Result<Vec<Violation>, String> {
     let read: Solutions = serde_json::from_slice(json).map_err(|error| error.to_string())?;
-    Ok(read.results.bindings)
+    let rows = read.results.bindings.into_iter();
+    Ok(rows.filter_map(|row| violation(check, row)).collect())
 }
 
 fn violation(check: &Check, row: Row) -> Option<Violation> {

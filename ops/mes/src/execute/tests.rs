@@ -14,6 +14,8 @@ struct Fakes {
     /// The skill that loses its component when it is run.
     dies_at: Mutex<Option<&'static str>>,
     fails_at: Option<&'static str>,
+    /// A skill and how its run ends; `None` if it does not end.
+    ends: Option<(&'static str, Option<Result<Outcome, SkillFault>>)>,
     /// A skill that runs until it is halted, because the gripper is lost meanwhile.
     halted_at: Mutex<Option<&'static str>>,
     halts: watch::Sender<u32>,
@@ -148,22 +150,16 @@ impl Runs for FakeSkill {
                 .send_modify(|lost| lost.push(GRIPPER.to_owned()));
             let mut halts = self.plant.halts.subscribe();
             halts.wait_for(|halts| *halts > 0).await.unwrap();
-            return Ok(Outcome {
-                run: 1,
-                succeeded: false,
-                message: "halted by session 3".into(),
-                results: vec![],
-                trace: vec![],
-            });
+            return Ok(failed("halted by session 3"));
         }
         if self.plant.fails_at == Some(&*name) {
-            return Ok(Outcome {
-                run: 1,
-                succeeded: false,
-                message: "nothing was gripped".into(),
-                results: vec![],
-                trace: vec![],
-            });
+            return Ok(failed("nothing was gripped"));
+        }
+        if let Some((_, end)) = self.plant.ends.as_ref().filter(|(at, _)| *at == name) {
+            return match end {
+                Some(end) => end.clone(),
+                None => std::future::pending().await,
+            };
         }
         let width = ("Width".to_owned(), Value::Double(0.03));
         let results = name.ends_with(".Grasp").then_some(width);
@@ -199,6 +195,16 @@ impl Runs for FakeSkill {
             });
         }
         "the connection broke".into()
+    }
+}
+
+fn failed(message: &str) -> Outcome {
+    Outcome {
+        run: 1,
+        succeeded: false,
+        message: message.into(),
+        results: vec![],
+        trace: vec![],
     }
 }
 
@@ -239,6 +245,7 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         lost: watch::channel(vec![]).0,
         dies_at: Mutex::new(None),
         fails_at: None,
+        ends: None,
         halted_at: Mutex::new(None),
         halts: watch::channel(0).0,
         unreachable: None,
@@ -461,8 +468,8 @@ async fn a_skill_that_fails_or_cannot_be_reached_is_not_tried_again() {
     );
 }
 
-#[tokio::test]
-async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
+/// A process that grasps and releases.
+fn grasps() -> Process {
     let alone = |step: usize, of: &str| Step {
         name: format!("step {step}"),
         needs: vec![Need {
@@ -472,11 +479,120 @@ async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
         }],
         ..Step::default()
     };
-    let mut process = Process {
+    Process {
         steps: vec![alone(0, "GraspSkillType"), alone(1, "ReleaseSkillType")],
         work: Job::Sequence,
         ..process()
+    }
+}
+
+#[tokio::test]
+async fn a_run_whose_end_is_unknown_has_no_end_and_is_repeated_by_nobody() {
+    let refused = SkillFault::Refused {
+        status: "BadUserAccessDenied".into(),
+        text: "Halt of gripper.Grasp".into(),
     };
+    let ends = [
+        Err(SkillFault::NotHalted("whether it moves is unknown".into())),
+        Err(SkillFault::Unexpected("its outcome is of run 7".into())),
+        Err(refused.clone()),
+        Ok(failed("halted; the outcome is unknown: no answer")),
+        Ok(failed(
+            "whether it was executed is not known: the skill needs a Reset",
+        )),
+    ];
+    for process in [grasps(), process()] {
+        for end in &ends {
+            let mut fakes = plant([gripper("gripper"), gripper("other")].concat());
+            fakes.ends = Some(("gripper.Grasp", Some(end.clone())));
+            let process = Process {
+                // The time is over when the Halt is refused.
+                within: match *end == Err(refused.clone()) {
+                    true => Duration::ZERO,
+                    false => process.within,
+                },
+                ..process.clone()
+            };
+            let told = Unknowns::default();
+            let fakes = Arc::new(fakes);
+            let as_plant: Arc<dyn Plant> = Arc::new(Arc::clone(&fakes));
+            let run = execute(&as_plant, &process, 1, &told).await;
+            assert_eq!((run.outcome, run.plans.len()), (How::Unknown, 1), "{run:?}");
+            let plan = &run.plans[0];
+            let mut grasps = plan.ran.iter().filter(|ran| ran.skill.ends_with("#Grasp"));
+            let grasp = grasps.next().unwrap();
+            assert_eq!((grasp.outcome, grasp.ended_ms), (How::Unknown, None));
+            assert_eq!((grasps.next(), plan.outcome), (None, How::Unknown));
+            let reason = run.reason.clone().unwrap();
+            assert!(reason.contains("unknown") || reason.contains("not known"));
+            assert_eq!(told.0.lock().unwrap().last(), Some(&reason));
+            let status = serde_json::to_value(&run).unwrap();
+            assert_eq!(status["outcome"], "unknown");
+            let triples = run.triples();
+            let ended = triples
+                .iter()
+                .filter(|triple| triple.predicate.ends_with("#endedAtTime"));
+            let done = plan.ran.iter().filter(|ran| ran.outcome == How::Done);
+            assert_eq!(ended.count(), done.count());
+            let knowledge = Knowledge::new().unwrap();
+            let source = Source::new(SourceKind::Run, &run.run);
+            knowledge.replace(&source, &triples, 1).unwrap();
+            let steps = knowledge.ask("run-steps", &[]).unwrap().rows;
+            let mut unknown = steps.iter().filter(|row| row["outcome"] == "unknown");
+            let unknown = unknown.next().unwrap();
+            assert_eq!(unknown["skill"], "urn:example:gripper#Grasp");
+            assert!(unknown.get("ended").is_none_or(serde_json::Value::is_null));
+        }
+    }
+}
+
+/// Keeps the reasons for which ends are unknown.
+#[derive(Default)]
+struct Unknowns(Mutex<Vec<String>>);
+
+#[async_trait]
+impl Teller for Unknowns {
+    async fn step(&self, _step: &'static str) {}
+
+    async fn unknown(&self, why: &str) {
+        self.0.lock().unwrap().push(why.to_owned());
+    }
+}
+
+#[tokio::test]
+async fn a_refused_start_is_no_unknown_end_and_another_component_does_the_step() {
+    let mut fakes = plant([gripper("gripper"), gripper("other")].concat());
+    let refused = SkillFault::Refused {
+        status: "BadInvalidState".into(),
+        text: "it is Suspended".into(),
+    };
+    fakes.ends = Some(("gripper.Grasp", Some(Err(refused))));
+    let (run, ..) = executed(fakes, &grasps()).await;
+    assert_eq!((run.outcome, run.plans.len()), (How::Done, 2), "{run:?}");
+    assert_eq!(run.plans[0].ran[0].outcome, How::Failed);
+}
+
+#[tokio::test]
+async fn a_skill_that_runs_when_its_process_is_given_up_has_an_unknown_end() {
+    let mut fakes = plant(gripper("gripper"));
+    fakes.ends = Some(("gripper.Grasp", None));
+    let fakes = Arc::new(fakes);
+    let as_plant: Arc<dyn Plant> = Arc::new(Arc::clone(&fakes));
+    let (process, told) = (grasps(), |_: &'static str| {});
+    let run = execute(&as_plant, &process, 1, &told);
+    let given_up = tokio::time::timeout(Duration::from_millis(100), run).await;
+    assert!(given_up.is_err());
+    let kept = fakes.kept.lock().unwrap();
+    let run = kept.last().unwrap();
+    assert_eq!(run.outcome, How::Unknown);
+    let ran = &run.plans[0].ran[0];
+    assert_eq!((ran.outcome, ran.ended_ms), (How::Unknown, None));
+    assert!(run.ended_ms.is_some() && run.plans[0].outcome == How::Unknown);
+}
+
+#[tokio::test]
+async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
+    let mut process = grasps();
     process.steps[0].parameters.push(Given {
         name: "Force".into(),
         value: 12.into(),
