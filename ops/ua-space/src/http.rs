@@ -223,7 +223,7 @@ pub(crate) fn encoded(value: &str) -> String {
 const JSON: &str = "application/json";
 const RESULTS: &str = "application/sparql-results+json, application/n-triples";
 /// The content of a request whose answer need not be text.
-const PROTOBUF: &str = "application/x-protobuf";
+pub(crate) const PROTOBUF: &str = "application/x-protobuf";
 /// The time limit of a request, longer than the time limit of a query.
 const LIMIT: Duration = Duration::from_secs(15);
 /// The time limit of a change, which may be large.

@@ -1,4 +1,4 @@
-//! Reads the datagrams of a file: one datagram, several lines, or a capture.
+//! Reads files: whole, or their datagrams (one datagram, several lines, or a capture).
 
 use std::fs::File;
 use std::io::{self, BufReader, Read};
@@ -60,6 +60,17 @@ pub(crate) fn open(file: &str, lines: bool) -> Result<Input, Failure> {
     }
 }
 
+/// Reads a whole file, `-` for stdin. The rest of a very large file is left out.
+pub(crate) fn read(file: &str) -> Result<Vec<u8>, Failure> {
+    let mut bytes = Vec::new();
+    let read = match file {
+        "-" => io::stdin().lock().take(LARGEST).read_to_end(&mut bytes),
+        path => File::open(path).and_then(|file| file.take(LARGEST).read_to_end(&mut bytes)),
+    };
+    read.map_err(|error| Failure::reading(name(file), &error))?;
+    Ok(bytes)
+}
+
 /// Returns the name of the file for messages.
 pub(crate) fn name(file: &str) -> &str {
     match file {
@@ -102,3 +113,5 @@ fn read_lines(text: &str) -> Result<Input, hex::HexError> {
 
 /// Maximum size of a datagram file with its comments, in bytes.
 const MAX_BYTES: u64 = 1 << 30;
+/// Maximum size of any other file, in bytes.
+const LARGEST: u64 = 256 << 20;

@@ -20,6 +20,7 @@ mod hex;
 mod http;
 mod init;
 mod input;
+mod interrupt;
 mod json_file;
 mod keys;
 mod layout;

@@ -49,13 +49,13 @@ use std::net::SocketAddr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use mappings::{SpaceId, TopicId};
-use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::Instant;
 use transport::{BUFFER, Carrier, Outgoing, Received};
 use uadp::{NetworkHeader, NetworkMessage, Timestamp};
 
 use crate::arguments::Group;
 use crate::exit::Failure;
+use crate::interrupt::Interrupt;
 use crate::report::warn;
 use crate::survey::look;
 use book::{Book, News};
@@ -72,8 +72,7 @@ pub(crate) struct Live {
     pub(crate) book: Book,
     prober: Prober,
     wants_calls: bool,
-    interrupt: Signal,
-    terminate: Signal,
+    interrupt: Interrupt,
     buffer: Vec<u8>,
     /// The keys of a secured group.
     sealing: Option<Sealing>,
@@ -141,9 +140,6 @@ pub(crate) async fn in_the_group(group: &Group, seconds: f64) -> Result<(InGroup
 impl Live {
     fn join(group: &Group) -> Result<Self, Failure> {
         let (carrier, shown_group) = carrier::open(group)?;
-        let on = |kind| {
-            signal(kind).map_err(|error| Failure::Io(format!("cannot catch signals: {error}")))
-        };
         Ok(Self {
             carrier,
             start: Instant::now(),
@@ -151,8 +147,7 @@ impl Live {
             book: Book::new(),
             prober: Prober::default(),
             wants_calls: false,
-            interrupt: on(SignalKind::interrupt())?,
-            terminate: on(SignalKind::terminate())?,
+            interrupt: Interrupt::catch()?,
             buffer: vec![0; BUFFER],
             sealing: match &group.keys {
                 Some(path) => Some(Sealing::read(path, group.sign)?),
@@ -302,8 +297,7 @@ impl Live {
         let until = self.start + until;
         tokio::select! {
             biased;
-            Some(()) = self.interrupt.recv() => Ok(Incoming::Interrupted),
-            Some(()) = self.terminate.recv() => Ok(Incoming::Interrupted),
+            () = self.interrupt.received() => Ok(Incoming::Interrupted),
             () = tokio::time::sleep_until(until) => Ok(Incoming::Nothing),
             received = self.carrier.recv(&mut self.buffer) => received
                 .map(Incoming::Message)
@@ -321,8 +315,7 @@ impl Live {
 
     /// Returns the nanoseconds since 1970 at a time since the group was joined.
     fn utc(&self, now: Duration) -> i128 {
-        let elapsed = i128::try_from(now.as_nanos()).unwrap_or(i128::MAX);
-        self.start_utc.saturating_add(elapsed)
+        utc(self.start_utc, now)
     }
 
     /// Sends the probes that are due.
@@ -401,6 +394,12 @@ fn take(
 pub(crate) fn unix_nanos() -> i128 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     i128::try_from(since.unwrap_or_default().as_nanos()).unwrap_or_default()
+}
+
+/// Returns the nanoseconds since 1970 at a time since `start`, which has the same origin.
+fn utc(start: i128, elapsed: Duration) -> i128 {
+    let elapsed = i128::try_from(elapsed.as_nanos()).unwrap_or(i128::MAX);
+    start.saturating_add(elapsed)
 }
 
 /// Returns the time `seconds` after `now`; without `seconds`, a time that is never reached.

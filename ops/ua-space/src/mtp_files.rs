@@ -10,7 +10,8 @@ use serde::Serialize;
 
 use crate::arguments::{MtpArguments, MtpRdf, MtpSkills, MtpVerb};
 use crate::exit::Failure;
-use crate::live::{Table, harmless, is_coloured};
+use crate::input;
+use crate::live::{Table, harmless, is_coloured, json};
 
 /// Runs `ua-space mtp`.
 pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), Failure> {
@@ -23,12 +24,7 @@ pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), Failure> {
 
 /// Reads a manifest, with the documents beside it that it refers to.
 pub(crate) fn read(file: &str) -> Result<Module, Failure> {
-    let mut bytes = Vec::new();
-    let read = match file {
-        "-" => io::stdin().lock().take(LARGEST).read_to_end(&mut bytes),
-        path => fs::File::open(path).and_then(|file| file.take(LARGEST).read_to_end(&mut bytes)),
-    };
-    read.map_err(|error| Failure::reading(crate::input::name(file), &error))?;
+    let bytes = input::read(file)?;
     let beside = Path::new(file).parent().unwrap_or_else(|| Path::new(""));
     let mut fetch = |name: &str| {
         let mut bytes = Vec::new();
@@ -37,7 +33,7 @@ pub(crate) fn read(file: &str) -> Result<Module, Failure> {
         Some(bytes)
     };
     Module::from_files(&bytes, &mut fetch)
-        .map_err(|error| Failure::Data(format!("{}: {error}", crate::input::name(file))))
+        .map_err(|error| Failure::Data(format!("{}: {error}", input::name(file))))
 }
 
 /// The contents of a manifest, by their numbers.
@@ -125,7 +121,7 @@ fn edition(module: &Module) -> &'static str {
     }
 }
 
-fn check(files: &[String], json: bool) -> Result<(), Failure> {
+fn check(files: &[String], is_json: bool) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     let mut faults = Vec::new();
     for file in files {
@@ -138,8 +134,8 @@ fn check(files: &[String], json: bool) -> Result<(), Failure> {
             Err(failure) => return Err(failure),
         };
         let checked = Checked::of(file, &module);
-        if json {
-            writeln!(out, "{}", to_json(&checked)?)?;
+        if is_json {
+            writeln!(out, "{}", json(&checked)?)?;
         } else {
             for finding in &module.findings {
                 let line = format!("{}: {file}: {finding}", severity(finding));
@@ -170,12 +166,6 @@ fn check(files: &[String], json: bool) -> Result<(), Failure> {
         true => Ok(()),
         false => Err(Failure::Data(faults.join("\n"))),
     }
-}
-
-fn to_json<T: Serialize>(value: &T) -> Result<String, Failure> {
-    let text = serde_json::to_string(value)
-        .map_err(|error| Failure::Io(format!("cannot write the output: {error}")))?;
-    Ok(mappings::harmless_json(&text))
 }
 
 /// A statement in JSON.
@@ -210,7 +200,7 @@ fn rdf(arguments: &MtpRdf) -> Result<(), Failure> {
     let mut out = io::BufWriter::new(io::stdout().lock());
     if arguments.json {
         let statements: Vec<Statement<'_>> = triples.iter().map(statement).collect();
-        writeln!(out, "{}", to_json(&statements)?)?;
+        writeln!(out, "{}", json(&statements)?)?;
     } else {
         for triple in &triples {
             writeln!(out, "{triple}")?;
@@ -285,7 +275,7 @@ fn skills(arguments: &MtpSkills) -> Result<(), Failure> {
         .collect();
     let mut out = io::stdout().lock();
     if arguments.json {
-        writeln!(out, "{}", to_json(&rows)?)?;
+        writeln!(out, "{}", json(&rows)?)?;
         return Ok(());
     }
     let columns = ["SKILL", "NUMBER", "ENDS", "PARAMETERS", "OUTPUTS"];
@@ -393,5 +383,5 @@ fn unit(bound: Option<&mtp::Bound>) -> Option<String> {
     Some(symbol.map_or_else(|| format!("unit {code}"), str::to_owned))
 }
 
-/// Maximum size of a file in bytes.
+/// Maximum size of another document in bytes.
 const LARGEST: u64 = 64 << 20;

@@ -6,10 +6,9 @@ use knowledge::owl::Ontology;
 
 use crate::arguments::Owl;
 use crate::exit::Failure;
-use crate::input::name;
+use crate::input::{name, read};
 use crate::live::harmless;
 use crate::report;
-use crate::source::read;
 
 /// Runs `ua-space owl`.
 pub(crate) fn owl(arguments: &Owl) -> Result<(), Failure> {

@@ -1,7 +1,6 @@
 //! `ua-space pea`: simulates the process module of a manifest as an OPC UA server.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{self, Write as _};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -16,12 +15,12 @@ use plant_opcua::types::{
     DataTypeId, DataValue, LocalizedText, NodeId, ObjectId, ObjectTypeId, QualifiedName,
     ReferenceTypeId, StatusCode, UAString, VariableTypeId, Variant,
 };
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::{Instant, MissedTickBehavior};
 
 use crate::arguments::PeaArguments;
 use crate::exit::Failure;
-use crate::live::harmless;
+use crate::interrupt::Interrupt;
+use crate::report::say;
 use crate::survey::look;
 
 /// Runs `ua-space pea` until SIGINT or SIGTERM.
@@ -52,23 +51,13 @@ pub(crate) fn pea(arguments: &PeaArguments) -> Result<(), Failure> {
             stuck_in,
         });
     look(async {
+        let mut interrupt = Interrupt::catch()?;
         let server = serve(&module, pea, endpoint)?;
         say(&format!("{} is at {}", module.name, server.url()))?;
-        ended().await?;
+        interrupt.received().await;
         server.stop().await;
         Ok(())
     })
-}
-
-async fn ended() -> Result<(), Failure> {
-    let cannot = |error: io::Error| Failure::Io(format!("cannot wait for a signal: {error}"));
-    let mut interrupt = signal(SignalKind::interrupt()).map_err(cannot)?;
-    let mut terminate = signal(SignalKind::terminate()).map_err(cannot)?;
-    tokio::select! {
-        _ = interrupt.recv() => {}
-        _ = terminate.recv() => {}
-    }
-    Ok(())
 }
 
 /// The simulated module, and the values to publish.
@@ -290,13 +279,6 @@ fn read_as(known: &PeaValue, given: &Variant) -> Option<PeaValue> {
 
 fn seconds(seconds: f64) -> Duration {
     Duration::try_from_secs_f64(seconds).unwrap_or_default()
-}
-
-fn say(text: &str) -> Result<(), Failure> {
-    let mut out = io::stdout().lock();
-    writeln!(out, "{}", harmless(text))?;
-    out.flush()?;
-    Ok(())
 }
 
 const TICK: Duration = Duration::from_millis(10);

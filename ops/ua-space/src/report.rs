@@ -85,6 +85,14 @@ impl Report {
     }
 }
 
+/// Writes a line to stdout.
+pub(crate) fn say(text: &str) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    writeln!(out, "{}", crate::live::harmless(text))?;
+    out.flush()?;
+    Ok(())
+}
+
 /// Writes a message to stderr.
 pub(crate) fn warn(what: &str) {
     // A closed stderr cannot be reported.

@@ -7,9 +7,9 @@ use rml::{Folder, Mapping, MappingFault, Output};
 
 use crate::arguments::{RdfFormat, Rml};
 use crate::exit::Failure;
+use crate::input::read;
 use crate::live::harmless;
 use crate::report;
-use crate::source::read;
 
 /// Runs `ua-space rml`.
 pub(crate) fn rml(arguments: &Rml) -> Result<(), Failure> {

@@ -1,7 +1,6 @@
 //! `ua-space source`: lists, adds and removes the sources of the knowledge of the plant.
 
-use std::fs::File;
-use std::io::{self, Read, Write as _};
+use std::io::{self, Write as _};
 use std::path::Path;
 
 use serde::Deserialize;
@@ -10,7 +9,9 @@ use crate::arguments::{Source, SourceAt, SourceVerb};
 use crate::ask::refusal;
 use crate::exit::Failure;
 use crate::http::{Change, Server, encoded};
+use crate::input::read;
 use crate::live::{Table, harmless, is_coloured};
+use crate::report::say;
 use crate::survey::look;
 
 /// Runs `ua-space source`.
@@ -237,16 +238,6 @@ fn change(
     })
 }
 
-pub(crate) fn read(file: &str) -> Result<Vec<u8>, Failure> {
-    let mut bytes = Vec::new();
-    let read = match file {
-        "-" => io::stdin().lock().take(LARGEST).read_to_end(&mut bytes),
-        path => File::open(path).and_then(|file| file.take(LARGEST).read_to_end(&mut bytes)),
-    };
-    read.map_err(|error| Failure::reading(crate::input::name(file), &error))?;
-    Ok(bytes)
-}
-
 /// Returns the kind of a source by the name and the contents of its file.
 fn kind_of(file: &str, contents: &[u8]) -> Result<&'static str, Failure> {
     let ending = Path::new(file).extension();
@@ -271,13 +262,7 @@ fn plain_name(file: &str) -> Result<String, Failure> {
         .ok_or_else(|| Failure::Usage(format!("{file}: give the source a name with --as")))
 }
 
-fn say(text: &str) -> Result<(), Failure> {
-    writeln!(io::stdout().lock(), "{}", harmless(text))?;
-    Ok(())
-}
-
 const CREATED: u16 = 201;
-const LARGEST: u64 = 256 << 20;
 
 #[cfg(test)]
 mod tests {

@@ -3,24 +3,8 @@
 use std::collections::BTreeMap;
 
 use crate::caex::Element;
-use crate::model::{Alarm, Bound, DataAssembly, Family, Link, Node, Output, OutputRole, Variable};
-use crate::read::Reading;
-
-/// Returns whether an element is a data assembly. Drafts have parameters and services of the
-/// instance list in the library of services.
-pub(crate) fn is_assembly(element: &Element, is_in_list: bool) -> bool {
-    let (library, rest) = element.path.split_once('/').unwrap_or_default();
-    match library {
-        "MTPDataObjectSUCLib" | "MTPDataAssemblySUCLib" => rest.starts_with("DataAssembly/"),
-        _ => is_in_list && !element.is_interface && !element.path.is_empty(),
-    }
-}
-
-/// Returns whether the children of an element are data assemblies.
-pub(crate) fn is_list(element: &Element) -> bool {
-    element.kind() == "InstanceList"
-        || (element.path.is_empty() && element.name == "DataAssemblies")
-}
+use crate::model::{Alarm, DataAssembly, Family, Link, Node, Output, OutputRole, Variable};
+use crate::read::{Reading, is_assembly, is_list, is_true};
 
 /// Returns the family of a data assembly by the whole path of its type.
 fn family(path: &str) -> Family {
@@ -126,9 +110,9 @@ impl<'a> Reading<'a> {
             name: element.name.clone(),
             role,
             kind: assembly.value_kind()?,
-            min: scale(&assembly, &["VSclMin", "VMin"]),
-            max: scale(&assembly, &["VSclMax", "VMax"]),
-            unit: scale(&assembly, &["VUnit"]),
+            min: assembly.bound(&["VSclMin", "VMin"]),
+            max: assembly.bound(&["VSclMax", "VMax"]),
+            unit: assembly.bound(&["VUnit"]),
             node: assembly.node(&["V", "VExt", "VOut", "VFbk"]).cloned(),
             assembly: assembly.id,
         })
@@ -185,7 +169,7 @@ impl<'a> Reading<'a> {
                 severity: element
                     .value(&["Severity"])
                     .and_then(|text| text.parse().ok()),
-                is_acknowledged: crate::read::is_true(element.value(&["AckRequired"])),
+                is_acknowledged: is_true(element.value(&["AckRequired"])),
                 trigger: node,
                 trigger_value: element
                     .value(&["TriggerValue"])
@@ -199,24 +183,6 @@ impl<'a> Reading<'a> {
     /// Returns the node of an attribute of a data assembly by the ID of the attribute.
     fn variable_node(&self, id: &str) -> Option<Node> {
         self.node_of(self.attribute_value(id)?)
-    }
-}
-
-/// Returns the bound of the first existing variable with one of these names.
-fn scale(assembly: &DataAssembly, names: &[&str]) -> Option<Bound> {
-    let variable = names.iter().find_map(|name| assembly.variable(name))?;
-    bound(variable)
-}
-
-/// Returns the bound in a variable: a node, or a finite number.
-fn bound(variable: &Variable) -> Option<Bound> {
-    match &variable.link {
-        Link::Node(node) => Some(Bound::Node(node.clone())),
-        Link::Constant(text) => text
-            .parse()
-            .ok()
-            .filter(|number: &f64| number.is_finite())
-            .map(Bound::Constant),
     }
 }
 

@@ -379,6 +379,15 @@ impl DataAssembly {
         }
     }
 
+    /// Returns the bound in the first existing variable with one of these names.
+    pub(crate) fn bound(&self, names: &[&str]) -> Option<Bound> {
+        let found = names.iter().find_map(|name| self.variable(name))?;
+        match &found.link {
+            Link::Node(node) => Some(Bound::Node(node.clone())),
+            Link::Constant(text) => Bound::of_text(text),
+        }
+    }
+
     /// Returns the kind of its value; `None` for data assemblies without a single value.
     #[must_use]
     pub fn value_kind(&self) -> Option<ValueKind> {
@@ -391,6 +400,32 @@ impl DataAssembly {
             () if is("Bin") => Some(ValueKind::Binary),
             () if is("Str") => Some(ValueKind::Text),
             () => None,
+        }
+    }
+}
+
+impl Bound {
+    /// Returns the finite number in a text.
+    pub(crate) fn of_text(text: &str) -> Option<Self> {
+        let number: f64 = text.parse().ok()?;
+        number.is_finite().then_some(Self::Constant(number))
+    }
+
+    /// Returns the number in the file.
+    #[must_use]
+    pub fn constant(&self) -> Option<f64> {
+        match self {
+            Self::Constant(number) => Some(*number),
+            Self::Node(_) => None,
+        }
+    }
+
+    /// Returns the node with the number.
+    #[must_use]
+    pub fn node(&self) -> Option<&Node> {
+        match self {
+            Self::Constant(_) => None,
+            Self::Node(node) => Some(node),
         }
     }
 }

@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use crate::model::{Bound, DataAssembly, Family, Link, Module, Node, Role, Service, ValueKind};
+use crate::model::{DataAssembly, Family, Link, Module, Node, Role, Service, ValueKind};
 use crate::state::{Command, State};
 
 /// The value of a node.
@@ -572,26 +572,6 @@ fn initial(assembly: &DataAssembly, name: &str) -> PeaValue {
         },
         () if NUMBERS.contains(&name) => PeaValue::Number(0.0),
         () => PeaValue::Boolean(name == "ApplyEn" || name.ends_with("ApplyEn")),
-    }
-}
-
-impl Bound {
-    /// Returns the number in the file.
-    #[must_use]
-    pub fn constant(&self) -> Option<f64> {
-        match self {
-            Self::Constant(number) => Some(*number),
-            Self::Node(_) => None,
-        }
-    }
-
-    /// Returns the node with the number.
-    #[must_use]
-    pub fn node(&self) -> Option<&Node> {
-        match self {
-            Self::Constant(_) => None,
-            Self::Node(node) => Some(node),
-        }
     }
 }
 

@@ -409,9 +409,8 @@ impl Graph<'_> {
     }
 
     fn unit(&mut self, parameter: &str, code: f64) {
-        let known = UNITS.iter().find(|(known, _)| f64::from(*known) == code);
-        if let Some((code, symbol)) = known {
-            self.say(parameter, v::UNIT_CODE, Object::Integer((*code).into()));
+        if let Some((code, symbol)) = known_unit(code) {
+            self.say(parameter, v::UNIT_CODE, Object::Integer(code.into()));
             self.text(parameter, v::UNIT, symbol);
         } else {
             self.say(parameter, v::UNIT_CODE, Object::Number(code));
@@ -481,9 +480,12 @@ impl Access {
 /// Returns the symbol of a unit by its number in VDI/VDE/NAMUR 2658-3, table 10.
 #[must_use]
 pub fn unit_symbol(code: f64) -> Option<&'static str> {
-    let mut known = UNITS.iter();
-    let found = known.find(|(known, _)| f64::from(*known) == code)?;
-    Some(found.1)
+    known_unit(code).map(|(_, symbol)| symbol)
+}
+
+fn known_unit(code: f64) -> Option<(u16, &'static str)> {
+    let mut known = UNITS.iter().copied();
+    known.find(|(known, _)| f64::from(*known) == code)
 }
 
 impl ValueKind {

@@ -1,8 +1,6 @@
 //! Statements about the servers, nodes, data assemblies, outputs and state machines of a module.
 
-use crate::model::{
-    Alarm, Bound, DataAssembly, Family, Link, Module, Output, OutputRole, Role, Service,
-};
+use crate::model::{Alarm, DataAssembly, Family, Link, Module, Output, OutputRole, Role, Service};
 use crate::rdf::{Graph, Object, escaped};
 use crate::state::{Command, State};
 use crate::vocabulary as v;
@@ -97,16 +95,8 @@ impl Graph<'_> {
             self.text(&output, v::HAS_VARIABLE_TYPE, kind.data_type());
             self.text(&output, v::PARAMETER_KIND, "sensor");
             self.node(&output, node);
-            let bound = |name: &str| -> Option<Bound> {
-                match &assembly.variable(name)?.link {
-                    Link::Node(node) => Some(Bound::Node(node.clone())),
-                    Link::Constant(text) => {
-                        let number: f64 = text.parse().ok()?;
-                        number.is_finite().then_some(Bound::Constant(number))
-                    }
-                }
-            };
-            let (min, max, unit) = (bound("VSclMin"), bound("VSclMax"), bound("VUnit"));
+            let [min, max, unit] =
+                ["VSclMin", "VSclMax", "VUnit"].map(|name| assembly.bound(&[name]));
             self.scale(&output, &label, [&min, &max, &unit]);
         }
     }

@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, HashMap};
 
 use crate::caex::{Element, MAX_FILE, ManifestError};
 use crate::container;
-use crate::elements;
 use crate::model::{
     Access, Bound, Control, Edition, Finding, Identifier, Item, Module, Node, OpcUaServer,
     Parameter, Procedure, Role, Service, ValueKind,
@@ -208,7 +207,7 @@ impl<'a> Reading<'a> {
                 _ => {}
             }
             let is_first = matches!(element.kind(), "ServiceControl") || kind_of(element).is_some();
-            if is_first || elements::is_assembly(element, is_in_list) {
+            if is_first || is_assembly(element, is_in_list) {
                 let index = match is_first {
                     true => &mut reading.assemblies,
                     false => &mut reading.values,
@@ -223,7 +222,7 @@ impl<'a> Reading<'a> {
                     index.insert(attribute.value.trim(), element);
                 }
             }
-            let is_list = elements::is_list(element);
+            let is_list = is_list(element);
             for child in element.children.iter().rev() {
                 waiting.push((child, server, is_list));
             }
@@ -311,14 +310,14 @@ impl<'a> Reading<'a> {
             let is_read = READ.contains(&element.kind())
                 || is_procedure(element)
                 || is_parameter(element)
-                || elements::is_assembly(element, is_in_list)
+                || is_assembly(element, is_in_list)
                 || (element.path.is_empty() && !element.is_interface);
             if !is_read {
                 let known = kinds.entry(&element.path).or_insert((0, element.line));
                 known.0 += 1;
                 known.1 = known.1.min(element.line);
             }
-            let is_list = elements::is_list(element);
+            let is_list = is_list(element);
             waiting.extend(element.children.iter().map(|child| (child, is_list)));
         }
         for (path, (count, line)) in kinds {
@@ -471,11 +470,7 @@ impl<'a> Reading<'a> {
         let value = assembly.value(&[name])?;
         match self.nodes.get(value) {
             Some(node) => Some(Bound::Node(node.clone())),
-            None => value
-                .parse()
-                .ok()
-                .filter(|number: &f64| number.is_finite())
-                .map(Bound::Constant),
+            None => Bound::of_text(value),
         }
     }
 
@@ -498,6 +493,22 @@ impl<'a> Reading<'a> {
 fn required(strategy: &Element) -> impl Iterator<Item = &str> {
     let ids = strategy.value(&["RequiredParameters"]).unwrap_or_default();
     ids.split_whitespace()
+}
+
+/// Returns whether an element is a data assembly. Drafts have parameters and services of the
+/// instance list in the library of services.
+pub(crate) fn is_assembly(element: &Element, is_in_list: bool) -> bool {
+    let (library, rest) = element.path.split_once('/').unwrap_or_default();
+    match library {
+        "MTPDataObjectSUCLib" | "MTPDataAssemblySUCLib" => rest.starts_with("DataAssembly/"),
+        _ => is_in_list && !element.is_interface && !element.path.is_empty(),
+    }
+}
+
+/// Returns whether the children of an element are data assemblies.
+pub(crate) fn is_list(element: &Element) -> bool {
+    element.kind() == "InstanceList"
+        || (element.path.is_empty() && element.name == "DataAssemblies")
 }
 
 fn is_procedure(element: &Element) -> bool {

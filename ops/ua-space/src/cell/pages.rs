@@ -73,14 +73,16 @@ pub(crate) struct ServerPage {
     pub(crate) up: bool,
 }
 
+/// The delays of a hop.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize, Serialize)]
 #[serde(default)]
 pub(crate) struct HopPage {
-    pub(crate) count: u64,
-    pub(crate) negative: u64,
     pub(crate) p50_us: f64,
     pub(crate) p99_us: f64,
     pub(crate) max_us: f64,
+    pub(crate) count: u64,
+    /// Number of negative delays, which are caused by clocks that disagree.
+    pub(crate) negative: u64,
 }
 
 impl Page {
@@ -165,10 +167,11 @@ mod tests {
 
     #[test]
     fn a_program_of_one_space_and_one_of_several_are_read() {
-        let one = r#"{"program":"bridge-ros2","space":2,"not_ready":[],"waiting_for":["a type"],"mapping":{"file":null,"hash":"ab","loaded":1,"stale":null},"topics":{"ua_1_2_3":{"sent":4,"dropped":{"too_big":1}}},"unknown":1}"#;
+        let one = r#"{"program":"bridge-ros2","space":2,"not_ready":[],"waiting_for":["a type"],"mapping":{"file":null,"hash":"ab","loaded":1,"stale":null},"topics":{"ua_1_2_3":{"sent":4,"dropped":{"too_big":1}}},"hops":{"out":{"count":1,"negative":0,"p50_us":1.5,"p99_us":2,"max_us":2}},"unknown":1}"#;
         let pages = parse(one).unwrap();
         assert_eq!(pages[0].label(), "bridge-ros2 (space 2)");
         assert_eq!(pages[0].topics["ua_1_2_3"].dropped["too_big"], 1);
+        assert_eq!(pages[0].hops["out"].p50_us, 1.5);
         assert_eq!(parse(&format!("[{one},{one}]")).unwrap().len(), 2);
         for other in ["", "{}", "[]x", "\"a\"", "{\"program\":1}"] {
             assert_eq!(parse(other), None, "{other}");

@@ -9,8 +9,9 @@ use mappings::TopicId;
 use uadp::action::{ActionDialect, ActionKind, ActionMessage};
 use uadp::discovery::{Announced, Announcement};
 use uadp::{
-    DataSetMessage, DecodeError, FieldEncoding, MessageKind, NetworkHeader, NetworkMessage,
-    NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, StatusCode,
+    DataSetMessage, DateTime, DecodeError, FieldEncoding, MessageKind, NetworkHeader,
+    NetworkMessage, NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, StatusCode,
+    Timestamp,
 };
 
 use super::application::Application;
@@ -112,6 +113,27 @@ pub(crate) struct Sample<'a> {
     /// The header of its NetworkMessage.
     pub(crate) network: NetworkHeader<'a>,
     pub(crate) message: DataSetMessage<'a>,
+}
+
+impl Sample<'_> {
+    /// Returns the time at which its writer took the value, in nanoseconds since 1970.
+    pub(crate) fn taken(&self) -> Option<i128> {
+        let header = self.message.header();
+        unix_nanos(header.timestamp, header.picoseconds)
+    }
+
+    /// Returns the time of sending, in nanoseconds since 1970.
+    pub(crate) fn sent(&self) -> Option<i128> {
+        unix_nanos(self.network.timestamp, self.network.picoseconds)
+    }
+}
+
+fn unix_nanos(time: Option<DateTime>, picoseconds: Option<u16>) -> Option<i128> {
+    let stamp = Timestamp {
+        time: time?,
+        picoseconds: picoseconds.unwrap_or_default(),
+    };
+    Some(stamp.unix_nanos())
 }
 
 impl Book {

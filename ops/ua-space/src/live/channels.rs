@@ -12,7 +12,7 @@ use messages::{Dialect, Leaf, MessageType, Plan, Rank, Selection, TypeName, Wire
 use serde_json::{Map, Value, json};
 use uadp::{BuiltinType, DataSetMessage, MessageKind, Scalar, Variant};
 
-use super::described::{Described, Field, What};
+use super::described::{Described, Field, What, is_integer};
 use super::plain;
 
 /// The channels of all topics with values. A topic with a new description gets a new channel.
@@ -381,14 +381,7 @@ fn schema_of(field: &Field) -> Value {
 const fn kind(builtin: BuiltinType) -> &'static str {
     match builtin {
         BuiltinType::Boolean => "boolean",
-        BuiltinType::SByte
-        | BuiltinType::Byte
-        | BuiltinType::Int16
-        | BuiltinType::UInt16
-        | BuiltinType::Int32
-        | BuiltinType::UInt32
-        | BuiltinType::Int64
-        | BuiltinType::UInt64 => "integer",
+        integer if is_integer(integer) => "integer",
         BuiltinType::Float | BuiltinType::Double => "number",
         BuiltinType::ExtensionObject => "object",
         _ => "string",

@@ -247,6 +247,22 @@ impl Field {
         parts.join(", ")
     }
 
+    /// Returns a field without a meaning: a scalar, or an array with the size, which is 0 if
+    /// unlimited.
+    pub(super) fn plain(name: &str, builtin: BuiltinType, size: Option<u32>) -> Self {
+        Self {
+            name: name.to_owned(),
+            builtin: Some(builtin),
+            rank: size.map_or(-1, |_| 1),
+            dimensions: size.into_iter().collect(),
+            max_string_length: 0,
+            description: String::new(),
+            meaning: Meaning::default(),
+            optional: false,
+            structure: None,
+        }
+    }
+
     pub(crate) const fn is_array(&self) -> bool {
         self.rank != -1
     }
@@ -262,6 +278,21 @@ impl Field {
             default: self.meaning.default.as_deref(),
         }
     }
+}
+
+/// Returns whether values of a type are integers.
+pub(super) const fn is_integer(builtin: BuiltinType) -> bool {
+    matches!(
+        builtin,
+        BuiltinType::SByte
+            | BuiltinType::Byte
+            | BuiltinType::Int16
+            | BuiltinType::UInt16
+            | BuiltinType::Int32
+            | BuiltinType::UInt32
+            | BuiltinType::Int64
+            | BuiltinType::UInt64
+    )
 }
 
 /// Returns a list of fields, as `TargetPosition: Double[6], [MaxVelocity: Double]`, with optional
@@ -458,15 +489,9 @@ mod tests {
     #[test]
     fn a_field_is_called_by_its_type_and_sizes() {
         let field = |rank, dimensions: &[u32]| Field {
-            name: "TargetPosition".to_owned(),
-            builtin: Some(BuiltinType::Double),
             rank,
             dimensions: dimensions.to_vec(),
-            max_string_length: 0,
-            description: String::new(),
-            meaning: Meaning::default(),
-            optional: false,
-            structure: None,
+            ..Field::plain("TargetPosition", BuiltinType::Double, None)
         };
         assert_eq!(field(-1, &[]).kind(), "Double");
         assert_eq!(field(1, &[6]).kind(), "Double[6]");

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 use uadp::BuiltinType;
 
-use super::described::{Field, list};
+use super::described::{Field, is_integer, list};
 use crate::values::FieldValue;
 use crate::values::variant_bytes;
 
@@ -131,14 +131,7 @@ fn scalar(builtin: BuiltinType, text: &str) -> Result<Value, String> {
             .parse::<bool>()
             .map(Value::from)
             .map_err(|_| expected()),
-        BuiltinType::SByte
-        | BuiltinType::Byte
-        | BuiltinType::Int16
-        | BuiltinType::UInt16
-        | BuiltinType::Int32
-        | BuiltinType::UInt32
-        | BuiltinType::Int64
-        | BuiltinType::UInt64 => match text.parse::<i128>() {
+        integer if is_integer(integer) => match text.parse::<i128>() {
             Ok(_) => Ok(json!(text)),
             Err(_) => Err(expected()),
         },
@@ -161,21 +154,13 @@ fn scalar(builtin: BuiltinType, text: &str) -> Result<Value, String> {
 mod tests {
     use uadp::action::ActionFields;
 
-    use super::super::described::Meaning;
     use super::super::plain;
     use super::*;
 
     fn field(name: &str, builtin: BuiltinType, size: Option<u32>, optional: bool) -> Field {
         Field {
-            name: name.to_owned(),
-            builtin: Some(builtin),
-            rank: size.map_or(-1, |_| 1),
-            dimensions: size.into_iter().collect(),
-            max_string_length: 0,
-            description: String::new(),
-            meaning: Meaning::default(),
             optional,
-            structure: None,
+            ..Field::plain(name, builtin, size)
         }
     }
 

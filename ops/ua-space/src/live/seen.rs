@@ -6,9 +6,9 @@ use std::net::SocketAddr;
 use mappings::TopicId;
 use serde::Serialize;
 
-use super::book::{Kind, News, Sample};
+use super::book::{Kind, News};
 use super::list::quality_name;
-use super::{Application, Go, Live, until};
+use super::{Application, Go, Live, until, utc};
 use crate::arguments::Group;
 use crate::exit::Failure;
 
@@ -60,11 +60,10 @@ pub(crate) async fn listened(group: &Group, seconds: f64) -> Result<Listened, Fa
     let mut senders: BTreeMap<SocketAddr, i128> = BTreeMap::new();
     let mut each = |news: News<'_>, now: std::time::Duration| {
         if let News::Sample(sample) = &news
-            && let Some(sent) = sent(sample)
+            && let Some(sent) = sample.sent()
             && (senders.len() < MOST_SENDERS || senders.contains_key(&sample.from))
         {
-            let arrived = start + i128::try_from(now.as_nanos()).unwrap_or(i128::MAX / 2);
-            let delay = arrived - sent;
+            let delay = utc(start, now) - sent;
             let shortest = senders.entry(sample.from).or_insert(delay);
             *shortest = (*shortest).min(delay);
         }
@@ -84,15 +83,6 @@ pub(crate) async fn listened(group: &Group, seconds: f64) -> Result<Listened, Fa
         senders: senders.into_iter().map(timing).collect(),
         dropped: dropped.collect(),
     })
-}
-
-/// Returns the time at which a message was sent, in nanoseconds since 1970.
-pub(super) fn sent(sample: &Sample<'_>) -> Option<i128> {
-    let stamp = uadp::Timestamp {
-        time: sample.network.timestamp?,
-        picoseconds: sample.network.picoseconds.unwrap_or_default(),
-    };
-    Some(stamp.unix_nanos())
 }
 
 fn topics(live: &Live) -> Vec<TopicSeen> {

@@ -17,7 +17,7 @@ use tokio::net::TcpListener;
 use self::hub::{Hub, Publication};
 use super::book::{Kind, News};
 use super::channels::{Channels, Unfit, is_value};
-use super::{Go, in_group, until};
+use super::{Go, in_group, until, utc};
 use crate::arguments::Viewers;
 use crate::exit::Failure;
 use crate::report::warn;
@@ -68,22 +68,15 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
 
 /// Handles a value or description of the group.
 fn take(news: &News<'_>, (channels, hub): (&mut Channels, &Hub), (start, now): (i128, Duration)) {
-    let channel = match news {
-        News::Sample(sample) => channels.channel(sample.topic, sample.described.as_ref(), now),
-        News::Announced(topic, Kind::Value, described, _) => {
-            channels.channel(*topic, Some(*described), now)
-        }
+    let (topic, described) = match news {
+        News::Sample(sample) => (sample.topic, sample.described.as_ref()),
+        News::Announced(topic, Kind::Value, described, _) => (*topic, Some(*described)),
         News::Announced(..) | News::Response(..) => return,
     };
-    let channel = match channel {
+    let channel = match channels.channel(topic, described, now) {
         Ok(channel) => channel,
         Err(Unfit::Undescribed) => return,
         Err(unfit) => return hub.leave_out(unfit),
-    };
-    let topic = match news {
-        News::Sample(sample) => sample.topic,
-        News::Announced(topic, ..) => *topic,
-        News::Response(..) => return,
     };
     hub.offer(topic, &channel);
     let News::Sample(sample) = news else {
@@ -95,14 +88,11 @@ fn take(news: &News<'_>, (channels, hub): (&mut Channels, &Hub), (start, now): (
     }
     let mut data = Vec::new();
     match channel.encode(message, &mut data) {
-        Ok(()) => {
-            let elapsed = i128::try_from(now.as_nanos()).unwrap_or_default();
-            hub.publish(&Publication {
-                channel: channel.id,
-                time: u64::try_from(start + elapsed).unwrap_or_default(),
-                data: &data,
-            });
-        }
+        Ok(()) => hub.publish(&Publication {
+            channel: channel.id,
+            time: u64::try_from(utc(start, now)).unwrap_or_default(),
+            data: &data,
+        }),
         Err(unfit) => hub.leave_out(unfit),
     }
 }

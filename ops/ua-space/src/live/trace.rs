@@ -16,14 +16,15 @@ use std::io::{self, Write as _};
 use std::path::Path;
 
 use mappings::TopicId;
-use serde::{Deserialize, Serialize};
-use uadp::{MessageKind, Timestamp};
+use serde::Serialize;
+use uadp::MessageKind;
 
 use super::book::{News, Sample};
 use super::list::json;
 use super::text::{Table, is_coloured, micros};
-use super::{Go, in_group, until};
+use super::{Go, in_group, until, utc};
 use crate::arguments::Trace;
+use crate::cell::{HopPage, page_of_url};
 use crate::exit::Failure;
 use crate::http::Server;
 use crate::report::warn;
@@ -46,7 +47,7 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
             let (mut delays, mut samples) = (Delays::default(), Samples::of(arguments));
             live.listen(end, &mut |news, now| {
                 if let News::Sample(sample) = &news {
-                    samples.take(delays.take(sample, arrival(start, now)));
+                    samples.take(delays.take(sample, utc(start, now)));
                 }
                 Go::On
             })
@@ -65,32 +66,24 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
             "--perfetto and --svg need samples: give another --seconds than 0".to_owned(),
         ));
     }
-    let servers: Vec<Server> = arguments
-        .metrics
-        .iter()
-        .map(|url| Server::parse(url))
-        .collect::<Result<_, _>>()?;
-    let (mut programs, mut away) = (Vec::new(), None);
-    for (server, url) in servers.iter().zip(&arguments.metrics) {
-        match look(status(server, url)) {
+    for url in &arguments.metrics {
+        Server::parse(url)?;
+    }
+    let (mut programs, mut is_missing) = (Vec::new(), false);
+    for url in &arguments.metrics {
+        match look(measured(url)) {
             Ok(found) => programs.extend(found),
             Err(failure) => {
                 warn(&failure.to_string());
-                away = Some(failure);
+                is_missing = true;
             }
         }
     }
     print(arguments, &programs, &topics)?;
-    match away {
-        Some(_) => Err(Failure::NotThere),
-        None => Ok(()),
+    match is_missing {
+        true => Err(Failure::NotThere),
+        false => Ok(()),
     }
-}
-
-/// Returns the time of an arrival in nanoseconds since 1970, from the start of listening and the
-/// time since then.
-fn arrival(start: i128, now: std::time::Duration) -> i128 {
-    start + i128::try_from(now.as_nanos()).unwrap_or(i128::MAX / 2)
 }
 
 /// The times of a message, in nanoseconds since 1970.
@@ -177,22 +170,25 @@ fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
 }
 
 /// The measurements of a program.
-#[derive(Debug, Deserialize, Serialize)]
+#[derive(Debug, Serialize)]
 struct Program {
     program: String,
     space: u8,
-    hops: BTreeMap<String, Hop>,
+    hops: BTreeMap<String, HopPage>,
 }
 
-/// The delays of a hop.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
-struct Hop {
-    p50_us: f64,
-    p99_us: f64,
-    max_us: f64,
-    count: u64,
-    /// Number of negative delays, which are caused by clocks that disagree.
-    negative: u64,
+/// Returns the measurements of a program in each space that it serves.
+async fn measured(url: &str) -> Result<Vec<Program>, Failure> {
+    let pages = page_of_url(url).await?;
+    if pages.iter().any(|page| page.hops.is_empty()) {
+        return Err(Failure::Data(format!("{url}/status has no hops")));
+    }
+    let programs = pages.into_iter().map(|page| Program {
+        program: page.program,
+        space: page.space,
+        hops: page.hops,
+    });
+    Ok(programs.collect())
 }
 
 /// A hop of a topic.
@@ -203,34 +199,13 @@ struct Row {
     name: Option<String>,
     hop: &'static str,
     #[serde(flatten)]
-    delays: Hop,
+    delays: HopPage,
 }
 
 #[derive(Serialize)]
 struct Shown<'a> {
     programs: &'a [Program],
     topics: &'a [Row],
-}
-
-/// The response of a program: an object for each space that it serves.
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum Status {
-    One(Box<Program>),
-    Several(Vec<Program>),
-}
-
-async fn status(server: &Server, url: &str) -> Result<Vec<Program>, Failure> {
-    let answer = server.get("/status").await?;
-    if answer.status != 200 {
-        let status = answer.status;
-        return Err(Failure::Unavailable(format!("{url}: HTTP status {status}")));
-    }
-    match serde_json::from_str(&answer.body) {
-        Ok(Status::One(program)) => Ok(vec![*program]),
-        Ok(Status::Several(programs)) => Ok(programs),
-        Err(_) => Err(Failure::Data(format!("{url}/status has no hops"))),
-    }
 }
 
 /// The latest delays of topics.
@@ -265,16 +240,7 @@ impl Delays {
             return None;
         }
         let topic = self.topics.entry(sample.topic).or_default();
-        let header = sample.message.header();
-        let nanos = |time: Option<uadp::DateTime>, picoseconds: Option<u16>| {
-            let stamp = Timestamp {
-                time: time?,
-                picoseconds: picoseconds.unwrap_or_default(),
-            };
-            Some(stamp.unix_nanos())
-        };
-        let taken = nanos(header.timestamp, header.picoseconds);
-        let sent = nanos(sample.network.timestamp, sample.network.picoseconds);
+        let (taken, sent) = (sample.taken(), sample.sent());
         let before = std::mem::replace(&mut topic.taken, taken);
         // The first received message may be a repetition too.
         let is_new = before.is_some() && before != taken;
@@ -327,7 +293,7 @@ impl Window {
         }
     }
 
-    fn hop(&self) -> Option<Hop> {
+    fn hop(&self) -> Option<HopPage> {
         if self.count + self.negative == 0 {
             return None;
         }
@@ -339,7 +305,7 @@ impl Window {
             let nanos = sorted.get(rank.saturating_sub(1)).copied();
             in_micros(nanos.unwrap_or_default())
         };
-        Some(Hop {
+        Some(HopPage {
             p50_us: quantile(50),
             p99_us: quantile(99),
             max_us: quantile(100),
@@ -360,7 +326,7 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
         writeln!(out, "{}", json(&Shown { programs, topics })?)?;
         return Ok(());
     }
-    let figures = |hop: &Hop| {
+    let figures = |hop: &HopPage| {
         let negative = match hop.negative {
             0 => "-".to_owned(),
             count => count.to_string(),
@@ -449,18 +415,5 @@ mod tests {
             window.record(1000);
         }
         assert_eq!(window.hop().unwrap().max_us, 1.0);
-    }
-
-    #[test]
-    fn a_program_of_one_space_and_one_of_several_are_read() {
-        let hops = r#"{"out":{"count":1,"negative":0,"p50_us":1.5,"p99_us":2,"max_us":2}}"#;
-        let one = format!(r#"{{"program":"bridge-ros2","space":2,"topics":{{}},"hops":{hops}}}"#);
-        for (text, wanted) in [(one.clone(), 1), (format!("[{one},{one}]"), 2)] {
-            let found = match serde_json::from_str(&text).unwrap() {
-                Status::One(_) => 1,
-                Status::Several(all) => all.len(),
-            };
-            assert_eq!(found, wanted);
-        }
     }
 }

@@ -64,6 +64,18 @@ fn label(topic: TopicId, name: &str) -> String {
     }
 }
 
+/// Returns the time between two values, and the number of values, which is `None` until the user
+/// interrupts the command. Without a rate, there is one value.
+fn pace(arguments: &Write) -> (Option<Duration>, Option<u64>) {
+    match arguments.rate {
+        Some(rate) => {
+            let period = Duration::from_secs_f64(1.0 / rate);
+            (Some(period), arguments.count)
+        }
+        None => (None, Some(1)),
+    }
+}
+
 /// Returns the value at its ua-server; `None` if no server has it.
 async fn find(live: &mut Live, arguments: &Write) -> Result<Option<ServedValue>, Failure> {
     live.want_all();

@@ -207,28 +207,14 @@ const MOST_ELEMENTS: usize = 10_000;
 mod tests {
     use super::*;
 
-    fn field(name: &str, builtin: BuiltinType, rank: i32, dimensions: &[u32]) -> Field {
-        Field {
-            name: name.to_owned(),
-            builtin: Some(builtin),
-            rank,
-            dimensions: dimensions.to_vec(),
-            max_string_length: 0,
-            description: String::new(),
-            meaning: crate::live::described::Meaning::default(),
-            optional: false,
-            structure: None,
-        }
-    }
-
     fn takes() -> Vec<Field> {
         fields(&[
-            field("goal_id", BuiltinType::ByteString, -1, &[]),
-            field("goal.pose.x", BuiltinType::Double, -1, &[]),
-            field("goal.pose.frame_id", BuiltinType::String, -1, &[]),
-            field("goal.stamp", BuiltinType::DateTime, -1, &[]),
-            field("goal.covariance", BuiltinType::Double, 1, &[2]),
-            field("goal.poses", BuiltinType::ExtensionObject, 1, &[0]),
+            Field::plain("goal_id", BuiltinType::ByteString, None),
+            Field::plain("goal.pose.x", BuiltinType::Double, None),
+            Field::plain("goal.pose.frame_id", BuiltinType::String, None),
+            Field::plain("goal.stamp", BuiltinType::DateTime, None),
+            Field::plain("goal.covariance", BuiltinType::Double, Some(2)),
+            Field::plain("goal.poses", BuiltinType::ExtensionObject, Some(0)),
         ])
     }
 

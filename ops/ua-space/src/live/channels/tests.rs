@@ -1,7 +1,6 @@
 use uadp::{DataSetHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder};
 
 use super::*;
-use crate::live::described::Meaning;
 
 const NOW: Duration = Duration::from_secs(10);
 
@@ -10,17 +9,8 @@ fn topic(text: &str) -> TopicId {
 }
 
 fn described(description: &str, fields: &[(&str, BuiltinType)]) -> Arc<Described> {
-    let fields = fields.iter().map(|(name, builtin)| Field {
-        name: (*name).to_owned(),
-        builtin: Some(*builtin),
-        rank: -1,
-        dimensions: Vec::new(),
-        max_string_length: 0,
-        description: String::new(),
-        meaning: Meaning::default(),
-        optional: false,
-        structure: None,
-    });
+    let fields = fields.iter();
+    let fields = fields.map(|(name, builtin)| Field::plain(name, *builtin, None));
     Arc::new(Described {
         name: "Robot.Place".to_owned(),
         description: description.to_owned(),

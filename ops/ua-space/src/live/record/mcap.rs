@@ -187,7 +187,6 @@ impl Mcap {
                 out.extend(length.to_le_bytes());
             });
         }
-        let mut checksum = crc32fast::Hasher::new();
         let footer = out.len();
         record(FOOTER, out, |out| {
             out.extend(offset(summary).to_le_bytes());
@@ -197,8 +196,8 @@ impl Mcap {
         if let Some(length) = out.get_mut(footer + 1..footer + 9) {
             length.copy_from_slice(&FOOTER_LENGTH.to_le_bytes());
         }
-        checksum.update(out.get(summary..).unwrap_or_default());
-        out.extend(checksum.finalize().to_le_bytes());
+        let checksum = crc32fast::hash(out.get(summary..).unwrap_or_default());
+        out.extend(checksum.to_le_bytes());
         out.extend(MAGIC);
     }
 

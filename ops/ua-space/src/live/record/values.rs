@@ -7,7 +7,7 @@ use std::time::Duration;
 use mappings::TopicId;
 use uadp::{
     DataSetMessage, FieldEncoding, MessageKind, NetworkHeader, NetworkMessage,
-    NetworkMessageEncoder, Timestamp,
+    NetworkMessageEncoder,
 };
 
 use super::mcap::{Mcap, Message};
@@ -221,21 +221,12 @@ impl Values {
 
 impl Times {
     fn of(sample: &Sample<'_>, arrived: i128) -> Self {
-        let header = sample.message.header();
-        let network = &sample.network;
-        let taken = header.timestamp.map(|time| (time, header.picoseconds));
-        let sent = network.timestamp.map(|time| (time, network.picoseconds));
-        let nanos = |(time, picoseconds): (_, Option<u16>)| {
-            let stamp = Timestamp {
-                time,
-                picoseconds: picoseconds.unwrap_or_default(),
-            };
-            u64::try_from(stamp.unix_nanos()).ok()
-        };
         let logged = u64::try_from(arrived).unwrap_or_default();
+        let published = sample.taken().or_else(|| sample.sent());
+        let published = published.and_then(|nanos| u64::try_from(nanos).ok());
         Self {
             logged,
-            published: taken.or(sent).and_then(nanos).unwrap_or(logged),
+            published: published.unwrap_or(logged),
         }
     }
 }

@@ -20,12 +20,19 @@ pub(super) struct Hub {
 
 #[derive(Debug, Default)]
 struct State {
-    /// The current channel of each topic, as it is advertised.
-    offered: BTreeMap<TopicId, (u16, Value)>,
+    /// The channels of each topic, as they are advertised: one for each description of the topic.
+    offered: BTreeMap<TopicId, Vec<Offered>>,
     clients: BTreeMap<u64, Arc<Client>>,
     last_client: u64,
     /// The reasons that were reported.
     told: Vec<Unfit>,
+}
+
+/// A channel as it is advertised.
+#[derive(Debug)]
+struct Offered {
+    channel: u16,
+    shown: Value,
 }
 
 /// A value in its channel.
@@ -103,7 +110,8 @@ impl Hub {
             "sessionId": format!("{}-{id}", std::process::id()),
         });
         client.tell(&info);
-        let channels: Vec<&Value> = state.offered.values().map(|(_, shown)| shown).collect();
+        let offered = state.offered.values().flatten();
+        let channels: Vec<&Value> = offered.map(|one| &one.shown).collect();
         if !channels.is_empty() {
             client.tell(&json!({"op": "advertise", "channels": channels}));
         }
@@ -129,29 +137,36 @@ impl Hub {
         self.state().clients.is_empty()
     }
 
-    /// Offers the channel of a topic. It replaces another channel of the topic.
+    /// Offers a channel of a topic. Its other channels stay, because writers with different
+    /// descriptions may alternate. [`Channels`](crate::live::channels::Channels) limits their
+    /// number.
     pub(super) fn offer(&self, topic: TopicId, channel: &Channel) {
         let mut state = self.state();
-        let before = state.offered.get(&topic).map(|(id, _)| *id);
-        if before == Some(channel.id) {
+        let others = state.offered.entry(topic).or_default();
+        if others.iter().any(|one| one.channel == channel.id) {
             return;
         }
+        // Viewers refuse a second channel of the same name.
+        let name = match others.iter().any(|one| one.name() == channel.name) {
+            true => format!("{}#{}", channel.name, others.len() + 1),
+            false => channel.name.clone(),
+        };
         let shown = json!({
             "id": channel.id,
-            "topic": channel.name,
+            "topic": name,
             "encoding": channel.encoding,
             "schemaName": channel.schema_name,
             "schema": channel.schema,
             "schemaEncoding": channel.schema_encoding,
         });
+        let news = json!({"op": "advertise", "channels": [&shown]});
+        others.push(Offered {
+            channel: channel.id,
+            shown,
+        });
         for client in state.clients.values() {
-            if let Some(before) = before {
-                client.tell(&json!({"op": "unadvertise", "channelIds": [before]}));
-                client.queue().subscriptions.retain(|_, of| *of != before);
-            }
-            client.tell(&json!({"op": "advertise", "channels": [shown]}));
+            client.tell(&news);
         }
-        state.offered.insert(topic, (channel.id, shown));
     }
 
     /// Returns whether a viewer subscribes to a channel.
@@ -223,8 +238,8 @@ impl Hub {
         };
         let is_offered = {
             let state = self.state();
-            let mut offered = state.offered.values();
-            offered.any(|(of, _)| *of == channel)
+            let mut offered = state.offered.values().flatten();
+            offered.any(|one| one.channel == channel)
         };
         if !is_offered {
             return client.refuse(&format!("channel {channel} is not offered"));
@@ -236,6 +251,16 @@ impl Hub {
 
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Offered {
+    /// Returns the name for viewers.
+    fn name(&self) -> &str {
+        self.shown
+            .get("topic")
+            .and_then(Value::as_str)
+            .unwrap_or_default()
     }
 }
 

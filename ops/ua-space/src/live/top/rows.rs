@@ -8,11 +8,10 @@ use clap::ValueEnum;
 use mappings::TopicId;
 use uadp::MessageKind;
 
-use super::super::Live;
 use super::super::book::News;
 use super::super::list::quality_name;
-use super::super::seen::sent;
 use super::super::text::{age, harmless, micros};
+use super::super::{Live, utc};
 use crate::cell::Page;
 
 /// The order of the rows.
@@ -91,9 +90,8 @@ impl Figures {
         }
         let counting = self.topics.entry(sample.topic).or_default();
         counting.values = counting.values.saturating_add(1);
-        if let Some(sent) = sent(sample) {
-            let arrived = start + i128::try_from(now.as_nanos()).unwrap_or(i128::MAX / 2);
-            push(&mut counting.delays, arrived - sent, MOST_DELAYS);
+        if let Some(sent) = sample.sent() {
+            push(&mut counting.delays, utc(start, now) - sent, MOST_DELAYS);
         }
     }
 

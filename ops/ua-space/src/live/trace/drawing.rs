@@ -6,6 +6,7 @@ use mappings::TopicId;
 
 use super::super::text::{harmless, micros};
 use super::{Delays, Topic, Window, in_micros};
+use crate::cell::HopPage;
 
 /// Returns the drawing of the topics with the longest delays.
 pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) -> String {
@@ -58,13 +59,12 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
     for (at, (name, topic)) in topics.iter().enumerate() {
         let y = HEAD + ROW * count(at);
         text(LEFT - 10.0, y + 20.0, "", "end", &abbreviated(name));
-        let label = format!("{} + {}", shown_of(&topic.origin), shown_of(&topic.network));
+        let [origin, network] = [&topic.origin, &topic.network].map(delays_of);
+        let p99 = shown(network.as_ref().map(|hop| hop.p99_us));
+        let [origin, network] = [origin, network].map(|hop| shown(hop.map(|hop| hop.p50_us)));
+        let label = format!("{origin} + {network}");
         text(LEFT, y + 38.0, "m", "start", &label);
-        let samples = format!(
-            "p99 {}, {} samples",
-            tail(&topic.network),
-            topic.network.count
-        );
+        let samples = format!("p99 {p99}, {} samples", topic.network.count);
         text(RIGHT, y + 44.0, "m", "start", &samples);
     }
     if topics.is_empty() {
@@ -138,20 +138,18 @@ fn histogram(svg: &mut String, window: &Window, y: f64) {
     );
 }
 
+/// Returns the delays of a hop, if it has any.
+fn delays_of(window: &Window) -> Option<HopPage> {
+    window.hop().filter(|hop| hop.count > 0)
+}
+
 /// Returns the median delay in microseconds; 0 without delays.
 fn median(window: &Window) -> f64 {
-    let hop = window.hop().filter(|hop| hop.count > 0);
-    hop.map_or(0.0, |hop| hop.p50_us)
+    delays_of(window).map_or(0.0, |hop| hop.p50_us)
 }
 
-fn shown_of(window: &Window) -> String {
-    let hop = window.hop().filter(|hop| hop.count > 0);
-    hop.map_or_else(|| "-".to_owned(), |hop| micros(hop.p50_us))
-}
-
-fn tail(window: &Window) -> String {
-    let hop = window.hop().filter(|hop| hop.count > 0);
-    hop.map_or_else(|| "-".to_owned(), |hop| micros(hop.p99_us))
+fn shown(delay: Option<f64>) -> String {
+    delay.map_or_else(|| "-".to_owned(), micros)
 }
 
 fn escaped(text: &str) -> String {

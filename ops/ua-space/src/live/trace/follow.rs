@@ -7,8 +7,8 @@ use serde::Serialize;
 use super::super::book::{Kind, News};
 use super::super::list::json;
 use super::super::text::micros;
-use super::super::{Ended, Go, in_group, names, until};
-use super::{Delays, Samples, Times, arrival};
+use super::super::{Ended, Go, in_group, names, until, utc};
+use super::{Delays, Samples, Times};
 use crate::arguments::{Target, Trace};
 use crate::exit::Failure;
 use crate::iso_time;
@@ -36,7 +36,7 @@ pub(super) fn follow(arguments: &Trace, target: &Target) -> Result<(), Failure> 
                 if sample.topic != topic {
                     return Go::On;
                 }
-                let times = delays.take(sample, arrival(start, now));
+                let times = delays.take(sample, utc(start, now));
                 samples.take(times);
                 if let Some(times) = times {
                     shown += 1;

@@ -3,7 +3,6 @@
 
 use std::time::Duration;
 
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::{MissedTickBehavior, interval, sleep};
 
 use super::super::text::harmless;
@@ -12,7 +11,8 @@ use super::protobuf::Message;
 use crate::arguments::Trace;
 use crate::cell::{HopPage, Page, TopicPage, page_of_url, pages_of_this_host};
 use crate::exit::Failure;
-use crate::http::{Change, Server};
+use crate::http::{Change, PROTOBUF, Server};
+use crate::interrupt::Interrupt;
 use crate::report::warn;
 
 /// Exports until the user interrupts the command.
@@ -20,33 +20,20 @@ pub(super) async fn export(arguments: &Trace, url: &str) -> Result<(), Failure> 
     let collector = Server::parse(url)?;
     let seconds = arguments.seconds.unwrap_or(USUAL).max(SHORTEST);
     let period = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
-    let on =
-        |kind| signal(kind).map_err(|error| Failure::Io(format!("cannot catch signals: {error}")));
-    let (mut interrupt, mut terminate) =
-        (on(SignalKind::interrupt())?, on(SignalKind::terminate())?);
+    let mut interrupt = Interrupt::catch()?;
     let mut ticks = interval(period);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut is_sent = false;
     let mut last = String::new();
     loop {
-        let is_over = tokio::select! {
-            biased;
-            Some(()) = interrupt.recv() => true,
-            Some(()) = terminate.recv() => true,
-            _ = ticks.tick() => false,
+        let round = async {
+            ticks.tick().await;
+            send(&collector, &pages(arguments).await).await
         };
-        if is_over {
-            return match is_sent {
-                true => Ok(()),
-                false => Err(Failure::NotThere),
-            };
-        }
-        let pages = pages(arguments).await;
-        let sending = send(&collector, &pages);
         let sent = tokio::select! {
-            sent = sending => sent,
-            Some(()) = interrupt.recv() => continue,
-            Some(()) = terminate.recv() => continue,
+            biased;
+            () = interrupt.received() => break,
+            sent = round => sent,
         };
         match sent {
             Ok(()) => {
@@ -61,6 +48,10 @@ pub(super) async fn export(arguments: &Trace, url: &str) -> Result<(), Failure> 
                 }
             }
         }
+    }
+    match is_sent {
+        true => Ok(()),
+        false => Err(Failure::NotThere),
     }
 }
 
@@ -90,7 +81,7 @@ async fn send(collector: &Server, pages: &[Page]) -> Result<(), String> {
         sleep(pause).await;
         let change = Change {
             method: "POST",
-            content_type: "application/x-protobuf",
+            content_type: PROTOBUF,
             body: body.clone(),
             user: None,
         };

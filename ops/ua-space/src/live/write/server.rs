@@ -9,14 +9,14 @@ use opcua::types::{
 };
 use plant_opcua::client::{Browse, Client, ClientConfig, ClientError, ClientUser, Link};
 use plant_opcua::pki;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::{MissedTickBehavior, interval};
 use uadp::Fields;
 
 use super::super::text::harmless;
-use super::{ServedValue, Tally, Written, value};
+use super::{ServedValue, Tally, Written, pace, value};
 use crate::arguments::Write;
 use crate::exit::Failure;
+use crate::interrupt::Interrupt;
 use crate::live::unix_nanos;
 
 /// Writes the value, once or at the rate of the command line. The session ends with the command, so
@@ -66,29 +66,22 @@ pub(super) async fn write(arguments: &Write, found: &ServedValue) -> Result<(), 
 struct Pace {
     ticks: Option<tokio::time::Interval>,
     left: Option<u64>,
-    interrupt: tokio::signal::unix::Signal,
-    terminate: tokio::signal::unix::Signal,
+    interrupt: Interrupt,
     is_interrupted: bool,
 }
 
 impl Pace {
     fn new(arguments: &Write) -> Result<Self, Failure> {
-        let on = |kind| {
-            signal(kind).map_err(|error| Failure::Io(format!("cannot catch signals: {error}")))
-        };
-        let ticks = arguments.rate.map(|rate| {
-            let mut ticks = interval(Duration::from_secs_f64(1.0 / rate));
+        let (period, left) = pace(arguments);
+        let ticks = period.map(|period| {
+            let mut ticks = interval(period);
             ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
             ticks
         });
         Ok(Self {
-            left: match arguments.rate {
-                Some(_) => arguments.count,
-                None => Some(1),
-            },
             ticks,
-            interrupt: on(SignalKind::interrupt())?,
-            terminate: on(SignalKind::terminate())?,
+            left,
+            interrupt: Interrupt::catch()?,
             is_interrupted: false,
         })
     }
@@ -98,7 +91,6 @@ impl Pace {
         if self.is_interrupted || self.left == Some(0) {
             return false;
         }
-        let (interrupt, terminate) = (&mut self.interrupt, &mut self.terminate);
         let ticks = self.ticks.as_mut();
         let tick = async {
             if let Some(ticks) = ticks {
@@ -107,8 +99,7 @@ impl Pace {
         };
         tokio::select! {
             biased;
-            Some(()) = interrupt.recv() => self.is_interrupted = true,
-            Some(()) = terminate.recv() => self.is_interrupted = true,
+            () = self.interrupt.received() => self.is_interrupted = true,
             () = tick => {}
         }
         self.left = self.left.map(|left| left.saturating_sub(1));
@@ -117,10 +108,7 @@ impl Pace {
 
     /// Completes when the user interrupts the command.
     async fn interrupted(&mut self) {
-        tokio::select! {
-            Some(()) = self.interrupt.recv() => {}
-            Some(()) = self.terminate.recv() => {}
-        }
+        self.interrupt.received().await;
         self.is_interrupted = true;
     }
 }

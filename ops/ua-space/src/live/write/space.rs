@@ -18,7 +18,7 @@ use uadp::{BuiltinType, Timestamp};
 
 use super::super::names::mapped;
 use super::super::text::harmless;
-use super::{Tally, Written, label, value};
+use super::{Tally, Written, label, pace, value};
 use crate::arguments::Write;
 use crate::exit::Failure;
 use crate::live::unix_nanos;
@@ -29,16 +29,12 @@ pub(super) fn write(arguments: &Write, mapping: &Path) -> Result<ExitCode, Failu
     if arguments.user.is_some() {
         warn("no ua-server has the value: --user has no effect");
     }
+    let (period, count) = pace(arguments);
     let order = Order {
         target: arguments.target.clone(),
         values: arguments.values.clone(),
-        period: arguments
-            .rate
-            .map(|rate| Duration::from_secs_f64(1.0 / rate)),
-        count: match arguments.rate {
-            Some(_) => arguments.count,
-            None => Some(1),
-        },
+        period,
+        count,
         json: arguments.json,
         topic: OnceLock::new(),
         outcome: Mutex::default(),

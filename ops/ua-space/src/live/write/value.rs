@@ -88,21 +88,8 @@ fn in_range(words: &[String], fields: &[Field]) -> Result<(), String> {
 
 /// Returns the fields of a variable of a mapping; empty if its type is not known.
 pub(super) fn fields_of(variable: &Variable) -> Vec<Field> {
-    let field = |name: &str, builtin, size: Option<Option<u32>>| Field {
-        name: name.to_owned(),
-        builtin: Some(builtin),
-        rank: size.map_or(-1, |_| 1),
-        dimensions: size
-            .map(|size| vec![size.unwrap_or_default()])
-            .unwrap_or_default(),
-        max_string_length: 0,
-        description: String::new(),
-        meaning: Meaning::default(),
-        optional: false,
-        structure: None,
-    };
     if let Some((builtin, is_array)) = variable.value_type {
-        let only = field(&variable.name, builtin, is_array.then_some(None));
+        let only = Field::plain(&variable.name, builtin, is_array.then_some(0));
         let range = variable.meaning.range();
         let meaning = Meaning {
             range,
@@ -113,9 +100,9 @@ pub(super) fn fields_of(variable: &Variable) -> Vec<Field> {
     let fields = variable.fields.iter().map(|leaf| {
         let size = match leaf.rank {
             Rank::Scalar => None,
-            Rank::Array { fixed } => Some(fixed),
+            Rank::Array { fixed } => Some(fixed.unwrap_or_default()),
         };
-        field(&leaf.path, leaf.builtin, size)
+        Field::plain(&leaf.path, leaf.builtin, size)
     });
     fields.collect()
 }
@@ -130,20 +117,6 @@ mod tests {
     use super::*;
     use crate::live::plain;
 
-    fn field(name: &str, builtin: BuiltinType, size: Option<u32>) -> Field {
-        Field {
-            name: name.to_owned(),
-            builtin: Some(builtin),
-            rank: size.map_or(-1, |_| 1),
-            dimensions: size.into_iter().collect(),
-            max_string_length: 0,
-            description: String::new(),
-            meaning: Meaning::default(),
-            optional: false,
-            structure: None,
-        }
-    }
-
     fn of(given: &[&str], fields: &[Field]) -> Result<Vec<Value>, String> {
         let given: Vec<String> = given.iter().map(|word| (*word).to_owned()).collect();
         let block = encoded(&given, fields, 1_700_000_000_123_456_789)?;
@@ -155,14 +128,14 @@ mod tests {
 
     #[test]
     fn a_single_value_needs_no_name_and_has_the_type_of_its_field() {
-        let speed = [field("Line.Speed", BuiltinType::Double, None)];
+        let speed = [Field::plain("Line.Speed", BuiltinType::Double, None)];
         assert_eq!(of(&["1"], &speed).unwrap(), [1.0]);
         assert_eq!(of(&["-0.5"], &speed).unwrap(), [-0.5]);
         assert_eq!(of(&["Line.Speed=2"], &speed).unwrap(), [2.0]);
-        let text = [field("Text", BuiltinType::String, None)];
+        let text = [Field::plain("Text", BuiltinType::String, None)];
         assert_eq!(of(&["a=b {c}"], &text).unwrap(), ["a=b {c}"]);
         assert_eq!(of(&[r#""1""#], &text).unwrap(), ["1"]);
-        let list = [field("Joints", BuiltinType::Float, Some(2))];
+        let list = [Field::plain("Joints", BuiltinType::Float, Some(2))];
         assert_eq!(
             of(&["[1, 2.5]"], &list).unwrap(),
             [serde_json::json!([1.0, 2.5])]
@@ -185,9 +158,9 @@ mod tests {
     #[test]
     fn parts_of_a_message_are_given_by_path_or_as_a_map_and_others_are_zero() {
         let twist = [
-            field("header.stamp", BuiltinType::DateTime, None),
-            field("twist.linear.x", BuiltinType::Double, None),
-            field("twist.angular.z", BuiltinType::Double, None),
+            Field::plain("header.stamp", BuiltinType::DateTime, None),
+            Field::plain("twist.linear.x", BuiltinType::Double, None),
+            Field::plain("twist.angular.z", BuiltinType::Double, None),
         ];
         let stamp = "2023-11-14T22:13:20.1234567Z";
         let wanted = [Value::from(stamp), 0.5.into(), 0.0.into()];
@@ -208,12 +181,12 @@ mod tests {
 
     #[test]
     fn numbers_out_of_the_range_are_refused() {
-        let mut speed = field("Speed", BuiltinType::Double, None);
+        let mut speed = Field::plain("Speed", BuiltinType::Double, None);
         speed.meaning.range = Some((0.0, 2.0));
         assert!(of(&["2"], std::slice::from_ref(&speed)).is_ok());
         let wrong = of(&["2.5"], std::slice::from_ref(&speed)).unwrap_err();
         assert_eq!(wrong, "2.5 is out of the range 0 to 2");
-        let mut list = field("Joints", BuiltinType::Double, Some(2));
+        let mut list = Field::plain("Joints", BuiltinType::Double, Some(2));
         list.meaning.range = Some((0.0, 2.0));
         assert!(of(&["[1, -1]"], &[list]).is_err());
     }

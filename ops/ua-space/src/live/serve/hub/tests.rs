@@ -1,4 +1,8 @@
+use std::time::Duration;
+
 use super::*;
+use crate::live::channels::Channels;
+use crate::live::described::{Described, What};
 
 fn published(hub: &Hub, byte: u8, size: usize) {
     hub.publish(&Publication {
@@ -12,7 +16,11 @@ fn published(hub: &Hub, byte: u8, size: usize) {
 fn hub() -> Hub {
     let hub = Hub::new("239.192.0.40:4840");
     let topic = "ua_1_2_10".parse().unwrap();
-    hub.state().offered.insert(topic, (7, json!({"id": 7})));
+    let offered = Offered {
+        channel: 7,
+        shown: json!({"id": 7}),
+    };
+    hub.state().offered.insert(topic, vec![offered]);
     hub
 }
 
@@ -79,6 +87,57 @@ fn a_viewer_subscribes_to_a_channel_once() {
     hub.handle(&client, r#"{"op":"unsubscribe","subscriptionIds":[5]}"#);
     hub.handle(&client, subscribe);
     assert!(hub.is_wanted(7));
+}
+
+#[test]
+fn writers_whose_descriptions_alternate_leave_all_subscriptions_in_place() {
+    let hub = Hub::new("239.192.0.40:4840");
+    let topic: TopicId = "ua_1_2_10".parse().unwrap();
+    let (_, client) = hub.connect().unwrap();
+    text(&client);
+    let mut channels = Channels::new();
+    let mut made = |description: &str| {
+        let described = Arc::new(Described {
+            name: "Left.Speed".to_owned(),
+            description: description.to_owned(),
+            ros_topics: Vec::new(),
+            command: false,
+            what: What::Value(Vec::new()),
+        });
+        let channel = channels.channel(topic, Some(&described), Duration::ZERO);
+        channel.unwrap()
+    };
+    let both = ["; first", "; second"].map(&mut made);
+    for channel in &both {
+        hub.offer(topic, channel);
+        let advertised = text(&client);
+        assert_eq!(advertised["op"], "advertise");
+        assert_eq!(advertised["channels"][0]["id"], channel.id);
+        // The number of a subscription differs from that of its channel.
+        client
+            .subscribe(u32::from(channel.id) + 40, channel.id)
+            .unwrap();
+    }
+    for _ in 0..3 {
+        for channel in &both {
+            hub.offer(topic, channel);
+            assert!(hub.is_wanted(channel.id));
+            hub.publish(&Publication {
+                channel: channel.id,
+                time: 0,
+                data: &[],
+            });
+            let Next::Value(value) = client.next() else {
+                panic!("a value and nothing else");
+            };
+            assert_eq!(value[1..5], (u32::from(channel.id) + 40).to_le_bytes());
+        }
+    }
+    let (_, late) = hub.connect().unwrap();
+    text(&late);
+    let advertised = text(&late);
+    let names = [0, 1].map(|at| advertised["channels"][at]["topic"].clone());
+    assert_eq!(names, ["Left.Speed", "Left.Speed#2"]);
 }
 
 #[test]
