@@ -6,7 +6,10 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use bridge_core::Local;
-use bridge_node::{Arguments, Carried, Context, Failure, FailureKind, KeyService, Program};
+use bridge_node::{
+    Arguments, Carried, Context, Failure, FailureKind, KeyService, Program, Rank,
+    RedundancyArguments,
+};
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser};
 use mappings::{Mapping, SpaceId};
 use mdns::{Bridge, TellingArguments, tell_bridge};
@@ -45,6 +48,8 @@ struct Flags {
     keys: KeyArguments,
     #[command(flatten)]
     told: TellingArguments,
+    #[command(flatten)]
+    redundancy: RedundancyArguments,
 }
 
 impl Parser for BridgeRos1 {
@@ -77,6 +82,7 @@ impl BridgeRos1 {
         for word in options.apply_arguments(&self.words)? {
             warn!(word, "ignored an unknown ROS argument");
         }
+        options.name = self.flags.redundancy.node_name(&options.name);
         Ok(options)
     }
 }
@@ -118,6 +124,10 @@ impl Program for BridgeRos1 {
 
     fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
         Ok(vec![SpaceId::ROS1])
+    }
+
+    fn rank(&self) -> Option<Rank> {
+        self.flags.redundancy.rank
     }
 
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {

@@ -770,6 +770,13 @@ impl Port for Ros1Port {
         }
     }
 
+    fn drop_waiting(&mut self, _at_once: bool) {
+        self.drop_opening();
+        for open in self.sinks.values().filter_map(|sink| sink.open.as_ref()) {
+            open.publisher.forget_all_latched();
+        }
+    }
+
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.calls.known(topic, Arc::clone(description));
         self.actions.known(topic, description);

@@ -80,6 +80,12 @@ impl Opening {
     pub(crate) fn is_empty(&self) -> bool {
         self.waiting.is_empty()
     }
+
+    /// Drops the events and returns their number.
+    pub(crate) fn drop_waiting(&mut self) -> u64 {
+        let count = self.waiting.drain(..).count();
+        u64::try_from(count).unwrap_or(u64::MAX)
+    }
 }
 
 impl Open {
@@ -258,5 +264,7 @@ mod tests {
             opening.queue(event()).unwrap();
         }
         assert!(opening.queue(event()).is_err());
+        assert_eq!(opening.drop_waiting(), u64::try_from(MOST_WAITING).unwrap());
+        assert!(opening.is_empty());
     }
 }

@@ -9,7 +9,10 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use bridge_core::Local;
-use bridge_node::{Arguments, Carried, Context, Failure, FailureKind, KeyService, Program};
+use bridge_node::{
+    Arguments, Carried, Context, Failure, FailureKind, KeyService, Program, Rank,
+    RedundancyArguments,
+};
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
 use mdns::{Bridge, TellingArguments, tell_bridge};
@@ -40,6 +43,8 @@ struct BridgeRos2 {
     keys: KeyArguments,
     #[command(flatten)]
     told: TellingArguments,
+    #[command(flatten)]
+    redundancy: RedundancyArguments,
     /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the
     /// mapping's only ROS 2 space
     #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = domain_number)]
@@ -111,7 +116,9 @@ impl BridgeRos2 {
         } = self.ros_args()?;
         Ok(NodeOptions {
             namespace: namespace.unwrap_or_else(|| self.node_namespace.clone()),
-            name: name.unwrap_or_else(|| self.node_name.clone()),
+            name: self
+                .redundancy
+                .node_name(name.as_deref().unwrap_or(&self.node_name)),
             gid: self.gid.0,
             use_sim_time: use_sim_time.unwrap_or(self.use_sim_time),
         })
@@ -230,6 +237,10 @@ impl Program for BridgeRos2 {
     fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
         self.chosen(mapping)
             .map_err(|message| Failure::new(FailureKind::Usage, message))
+    }
+
+    fn rank(&self) -> Option<Rank> {
+        self.redundancy.rank
     }
 
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {

@@ -494,6 +494,19 @@ impl Outlet {
         u64::try_from(self.waiting.len()).unwrap_or(u64::MAX)
     }
 
+    /// Drops the waiting samples and returns their number, and removes the written values from the
+    /// history: with `at_once` also for present readers that have not acknowledged them.
+    pub fn drop_waiting(&mut self, at_once: bool, now: Instant) -> u64 {
+        let count = self.waiting();
+        self.waiting.clear();
+        self.forget_stored(now);
+        if at_once {
+            self.forget_written();
+            self.to_forget = None;
+        }
+        count
+    }
+
     /// Handles the loss of the last reader.
     fn leave_alone(&mut self, now: Instant) {
         let mut held = None;

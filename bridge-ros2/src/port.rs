@@ -621,6 +621,21 @@ impl Port for Ros2Port {
         }
     }
 
+    fn drop_waiting(&mut self, at_once: bool) {
+        let now = Instant::now();
+        for (topic, sink) in &mut self.sinks {
+            let Some(open) = sink.open.as_mut() else {
+                continue;
+            };
+            let count = open.outlet.drop_waiting(at_once, now);
+            self.schedule.waiting |= open.outlet.is_waiting();
+            if count > 0 {
+                let cause = (Reason::Takeover, "waited in its writer");
+                self.events.push_back(lost(*topic, cause, count));
+            }
+        }
+    }
+
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.calls.known(topic, Arc::clone(description));
         self.actions.known(topic, description);

@@ -73,9 +73,15 @@ impl Cell {
     /// Returns bridge-ros2 in the domain of `args` or of the mapping, not started yet.
     #[must_use]
     pub fn bridge_ros2_alone(&self, args: &[&str]) -> Started {
+        self.bridge_ros2_at(args, METRICS_ROS2)
+    }
+
+    /// Returns bridge-ros2 with another metrics address, not started yet.
+    #[must_use]
+    pub fn bridge_ros2_at(&self, args: &[&str], metrics: &str) -> Started {
         Started::new("bridge-ros2", &program("bridge-ros2"))
             .args(args)
-            .args(["--interface", "lo", "--metrics", METRICS_ROS2])
+            .args(["--interface", "lo", "--metrics", metrics])
     }
 
     /// Returns the example of bridge-ros2 that republishes a topic of domain 2 as another topic,

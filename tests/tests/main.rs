@@ -36,6 +36,7 @@ mod plug_and_produce;
 mod pure_crates;
 mod rate;
 mod recording;
+mod redundancy;
 mod reload;
 mod ros1;
 mod ros1_actionlib;

@@ -28,6 +28,23 @@ impl Ros1Port {
         self.flush_at = is_waiting.then(|| Instant::now() + FLUSH);
     }
 
+    /// Drops events that wait for subscribers, because another bridge publishes.
+    pub(super) fn drop_opening(&mut self) {
+        for (topic, sink) in &mut self.sinks {
+            let opening = sink.open.as_mut().and_then(|open| open.opening.as_mut());
+            let count = opening.map_or(0, |opening| opening.drop_waiting());
+            if count > 0 {
+                self.events.push_back(PortEvent::Lost {
+                    topic: Some(*topic),
+                    reason: Reason::Takeover,
+                    why: "waited for a subscriber",
+                    count,
+                });
+            }
+        }
+        self.flush_at = None;
+    }
+
     /// Reports events that no subscriber was there for.
     pub(super) fn unheard(&mut self, topic: TopicId, count: u64) {
         if count > 0 {

@@ -93,11 +93,15 @@ pub enum Reason {
     UnknownKey,
     /// There is no key to secure the message.
     NoKeys,
+    /// A takeover between redundant bridges: an own sample that may not have been sent, an event
+    /// that the former active bridge may have delivered, or a message of a bridge that is not
+    /// active.
+    Takeover,
 }
 
 impl Reason {
     /// All reasons in the order of their counters.
-    pub const ALL: [Self; 39] = [
+    pub const ALL: [Self; 40] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -137,6 +141,7 @@ impl Reason {
         Self::Replayed,
         Self::UnknownKey,
         Self::NoKeys,
+        Self::Takeover,
     ];
 
     /// Returns the label of the counter.
@@ -182,6 +187,7 @@ impl Reason {
             Self::Replayed => "replayed",
             Self::UnknownKey => "unknown_key",
             Self::NoKeys => "no_keys",
+            Self::Takeover => "takeover",
         }
     }
 

@@ -112,6 +112,11 @@ impl Gate {
         self.held.replace(sample)
     }
 
+    /// Removes the waiting sample and returns it.
+    pub(crate) fn drop_held(&mut self) -> Option<Waiting> {
+        self.held.take()
+    }
+
     /// Returns the time at which the waiting sample may be published.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.held.as_ref().and(self.opens)
@@ -138,7 +143,7 @@ impl Gate {
 }
 
 /// Returns the encoded fields of a sample.
-fn block(sample: &Encoded) -> Result<&[u8], DecodeError> {
+pub(crate) fn block(sample: &Encoded) -> Result<&[u8], DecodeError> {
     let network = NetworkMessage::decode(&sample.bytes)?;
     let message = network.messages().next().transpose()?;
     let fields = message.map(|message| message.fields()).transpose()?;

@@ -36,6 +36,7 @@ mod place;
 mod plans;
 mod queue;
 mod reader;
+mod redundancy;
 mod room;
 mod router;
 mod settings;
@@ -58,8 +59,12 @@ pub use guard::{GroupState, Guard, KeyDelivery, Unopened, policy_of};
 pub use hops::{Delays, Hop, Hops};
 pub use loop_rule::{Owned, Side, What, may_cross};
 pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
+pub use redundancy::{
+    Heartbeat, MuteCause, Rank, Redundancy, RedundancyCounts, RedundantPeer, Role, RoleChange,
+    SwitchRefusal, Takeover, TakeoverCause,
+};
 pub use room::Room;
-pub use router::Router;
+pub use router::{MutedSamples, Router};
 pub use settings::{Local, Now, Relay, Settings};
 pub use uadp::action::{ExecutionId, Refusal};
 pub use uadp::discovery::MessageSecurityMode;

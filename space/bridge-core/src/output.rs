@@ -11,6 +11,7 @@ use crate::call::{Answered, AskId, CallDescription, Execution};
 use crate::confirm::Arrival;
 use crate::counters::Reason;
 use crate::description::Described;
+use crate::redundancy::RoleChange;
 
 /// An action that the Router requests from its caller.
 #[derive(Debug)]
@@ -33,6 +34,14 @@ pub enum Output {
         /// The whole UDP payload.
         bytes: Vec<u8>,
     },
+    /// The heartbeat of a redundant bridge, to send before everything else. Report the result with
+    /// [`heartbeat_sent`](crate::Router::heartbeat_sent).
+    Heartbeat {
+        /// The whole UDP payload.
+        bytes: Vec<u8>,
+    },
+    /// The role of this program among the redundant bridges of its space has changed, to log.
+    Role(RoleChange),
     /// A sample of another space to publish.
     Delivery(Delivery),
     /// A value of another space was received with an unknown local type, or its writer announced a

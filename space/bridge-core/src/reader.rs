@@ -376,7 +376,11 @@ impl Reader {
                 SequenceOrder::Older { .. } if !restarted => return Err(Reason::Stale),
                 SequenceOrder::Newer { missed } => {
                     next = true;
-                    u16::try_from(missed).unwrap_or(u16::MAX)
+                    // Another sender counts on its own, or skips numbers.
+                    match moved {
+                        true => 0,
+                        false => u16::try_from(missed).unwrap_or(u16::MAX),
+                    }
                 }
                 SequenceOrder::Same | SequenceOrder::Older { .. } | SequenceOrder::Invalid => 0,
             },

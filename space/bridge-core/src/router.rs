@@ -15,6 +15,7 @@ mod held;
 mod late;
 mod own;
 mod receive;
+mod redundant;
 mod reload;
 mod roll;
 mod send;
@@ -51,6 +52,8 @@ use calls::Calls;
 use chunks::Chunks;
 use discovery::Discovery;
 use own::Claims;
+pub use redundant::MutedSamples;
+use redundant::{ActiveSender, Redundant};
 use told::About;
 
 /// Decides which messages cross between a space and UADP. The crate documentation describes its
@@ -82,6 +85,10 @@ pub struct Router {
     claims: Option<Box<Claims>>,
     /// The secured groups; `None` without secured groups.
     guard: Option<Box<Guard>>,
+    /// The redundancy of the own space; `None` without redundancy.
+    redundant: Option<Box<Redundant>>,
+    /// The redundant bridges of other spaces.
+    redundant_senders: BTreeMap<SpaceId, ActiveSender>,
     /// The broker between the programs; `None` for a network that does not store messages.
     relay: Option<Relay>,
     /// Whether the message in processing was received unsecured.
@@ -132,6 +139,8 @@ impl Router {
             instance: [0; 16],
             claims: None,
             guard,
+            redundant: None,
+            redundant_senders: BTreeMap::new(),
             relay: None,
             in_clear: true,
             confirmers: BTreeMap::new(),
@@ -332,6 +341,7 @@ impl Router {
     ) -> Verdict {
         let (max_datagram, _) = self.sizes();
         let large = encoded.bytes.len() > usize::from(max_datagram);
+        let muted = self.is_muted();
         let Some(Topic {
             role: Role::Ours(writer),
             lasting,
@@ -342,7 +352,11 @@ impl Router {
             return Verdict::Drop(Reason::Looped);
         };
         // Only a sent message uses up a sequence number.
-        encoded.number(writer.next_sequence());
+        let sequence = match muted {
+            true => writer.expected_sequence(),
+            false => writer.next_sequence(),
+        };
+        encoded.number(sequence);
         let message = if large {
             Message::Large(Arc::new(encoded))
         } else {
@@ -365,6 +379,9 @@ impl Router {
         );
         if is_confirmed {
             self.look_for_confirmers(topic, now);
+        }
+        if muted {
+            self.adopt_followed(topic);
         }
         if gave_way {
             self.count(About::topic(topic), Reason::TooManyPublishers, 1, || {
@@ -435,6 +452,7 @@ impl Router {
 
     /// Repeats values, sends keep-alives, and detects silent topics that are due by `now`.
     pub fn handle_timeout(&mut self, now: Now) {
+        self.look_at_redundancy(now);
         while let Some(Reverse((at, topic))) = self.timers.peek().copied() {
             if at > now.monotonic {
                 break;
@@ -477,10 +495,13 @@ impl Router {
         let claims = self.claims.as_ref();
         let claims = claims.and_then(|claims| claims.due(self.mapping.pubsub().receive_timeout));
         let keys = self.guard.as_ref().and_then(|guard| guard.due());
-        [timer, pace, chunks, discovery, calls, claims, keys]
-            .into_iter()
-            .flatten()
-            .min()
+        let redundancy = self.redundancy_due();
+        [
+            timer, pace, chunks, discovery, calls, claims, keys, redundancy,
+        ]
+        .into_iter()
+        .flatten()
+        .min()
     }
 
     /// Records that the local side published a delivery of the topic at `now`. The value is good.
@@ -570,6 +591,7 @@ impl Router {
     fn handle_due(&mut self, topic: TopicId, now: Now) {
         self.expire_held(topic, now);
         let (key_frames, keep_alives, silence) = self.periods();
+        let muted = self.is_muted();
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
         };
@@ -614,7 +636,8 @@ impl Router {
                         let expected = writer.expected_sequence();
                         // Waiting items contain more information than a keep-alive.
                         let buffer = self.spare.pop().unwrap_or_default();
-                        if !entry.has_more()
+                        if !muted
+                            && !entry.has_more()
                             && let Some(datagram) = keep_alive(buffer, topic, expected, now.utc)
                         {
                             entry.counters.keep_alives += 1;
@@ -655,7 +678,10 @@ impl Router {
                 (by, trigger.cloned())
             }
         };
-        self.tell(Output::CommanderLost { topic });
+        let muted = self.is_muted_locally();
+        if !muted {
+            self.tell(Output::CommanderLost { topic });
+        }
         let mut payload = self.buffer();
         let written = match stop {
             Some(stop) => stop.write(now.utc, &mut payload),
@@ -671,19 +697,21 @@ impl Router {
             );
             return;
         }
-        self.push(
-            of,
-            Item::Delivery(Delivery {
-                topic: of,
-                payload,
-                source: Some(now.utc),
-                status: GOOD,
-                arrived: now.utc,
-                instance: None,
-                kept: Kept::Alone,
-                lasting: false,
-            }),
-        );
+        let delivery = Delivery {
+            topic: of,
+            payload,
+            source: Some(now.utc),
+            status: GOOD,
+            arrived: now.utc,
+            instance: None,
+            kept: Kept::Alone,
+            lasting: false,
+        };
+        if muted {
+            self.mute_loss(delivery, now);
+        } else {
+            self.push(of, Item::Delivery(delivery));
+        }
     }
 
     /// Adds the topic to the timer list with its next due time.

@@ -7,6 +7,7 @@ use mappings::SpaceId;
 use uadp::{DateTime, Timestamp};
 
 use crate::confirm::{Arrival, Awaited, Confirming, Mark};
+use crate::gate::block;
 use crate::output::PublisherKey;
 use crate::pace::Pace;
 
@@ -67,6 +68,9 @@ struct Kept {
     /// under its own number for readers that show it; readers that already have it drop it.
     is_state: bool,
     message: Message,
+    /// Whether its stamp is the stamp of another bridge, which sends this topic while this bridge
+    /// is muted.
+    is_adopted: bool,
 }
 
 /// The message of a sample.
@@ -171,6 +175,19 @@ impl Encoded {
         })
     }
 
+    /// Returns whether it is a keep-alive.
+    pub(crate) const fn is_keep_alive(&self) -> bool {
+        self.sequence_at == usize::MAX
+    }
+
+    /// Sets the Timestamp and PicoSeconds of the DataSetMessage.
+    fn take_at(&mut self, stamp: Timestamp) {
+        let at = self.sequence_at.saturating_add(2);
+        patch(&mut self.bytes, at, &stamp.time.0.to_le_bytes());
+        let at = at.saturating_add(8);
+        patch(&mut self.bytes, at, &stamp.picoseconds.to_le_bytes());
+    }
+
     pub(crate) fn number(&mut self, sequence: u16) {
         patch(&mut self.bytes, self.sequence_at, &sequence.to_le_bytes());
     }
@@ -216,6 +233,67 @@ impl Writer {
         stamp
     }
 
+    /// Continues with the sequence number and the stamp of another bridge, which sends this topic
+    /// while this bridge is muted.
+    pub(crate) fn follow(&mut self, next: u16, stamp: Option<Timestamp>) {
+        self.sequence = next;
+        self.started = true;
+        let is_later = |taken: Timestamp| stamp.is_some_and(|stamp| stamp > taken);
+        if self.taken.is_none_or(is_later) {
+            self.taken = stamp.or(self.taken);
+        }
+    }
+
+    /// Sets the stamp of another bridge for the kept sample with these fields. Readers then
+    /// recognise its repetitions. Returns whether there is such a sample.
+    pub(crate) fn adopt(&mut self, fields: &[u8], stamp: Timestamp) -> bool {
+        for kept in &mut self.kept {
+            if let Message::Datagram(encoded) = &mut kept.message
+                && block(encoded).is_ok_and(|own| own == fields)
+            {
+                encoded.take_at(stamp);
+                kept.is_adopted = true;
+                return true;
+            }
+        }
+        false
+    }
+
+    /// Gives the only kept sample a stamp of its own, because the other bridge has sent another
+    /// value since.
+    pub(crate) fn disown(&mut self, utc: Timestamp) {
+        let [
+            Kept {
+                is_adopted: true, ..
+            },
+        ] = self.kept.as_slice()
+        else {
+            return;
+        };
+        let stamp = self.stamp(utc);
+        if let Some(kept) = self.kept.first_mut()
+            && let Message::Datagram(encoded) = &mut kept.message
+        {
+            encoded.take_at(stamp);
+            kept.is_adopted = false;
+        }
+    }
+
+    /// Ends all repetitions without an outcome for the newest event.
+    pub(crate) fn end_repetitions(&mut self) {
+        self.supersede();
+        self.next = usize::MAX;
+    }
+
+    /// Continues after another bridge that has sent this topic: skips sequence numbers that the
+    /// other bridge may have used.
+    pub(crate) fn continue_after(&mut self, skipped: u16) {
+        self.end_repetitions();
+        if self.started {
+            self.sequence = self.sequence.wrapping_add(skipped);
+        }
+    }
+
     /// Returns the sequence number of a keep-alive: the number of the next expected message
     /// (OPC 10000-14 7.2.4.5.8).
     pub(crate) const fn expected_sequence(&self) -> u16 {
@@ -247,6 +325,7 @@ impl Writer {
         match found.and_then(|at| Some((at, self.kept.get_mut(at)?))) {
             Some((at, kept)) => {
                 kept.is_state = is_state;
+                kept.is_adopted = false;
                 match (&mut kept.message, message) {
                     (Message::Datagram(last), Message::Datagram(new)) => {
                         last.bytes.clone_from(&new.bytes);
@@ -271,6 +350,7 @@ impl Writer {
                     publisher,
                     is_state,
                     message: message.share(),
+                    is_adopted: false,
                 });
             }
         }

@@ -31,6 +31,7 @@ mod large;
 mod loop_freedom;
 mod metadata;
 mod publish;
+mod redundancy;
 mod reload;
 mod router;
 mod secured;

@@ -25,6 +25,7 @@ pub mod policy;
 mod port;
 mod present;
 mod program;
+mod redundancy;
 mod restart;
 mod run;
 mod service;
@@ -40,7 +41,7 @@ pub use awaited::{AwaitedPeers, near};
 pub use bridge_core::{
     ActionFamily, Answered, Application, Arrival, AskError, AskErrorKind, AskId, CallDescription,
     CallField, CallMap, CallRole, CallStructure, Counters, Described, Executed, ExecutionId,
-    Handover, Kept, Offered, OfferedType, Owned, PublisherKey, Reason, Refusal, Room, Router,
+    Handover, Kept, Offered, OfferedType, Owned, PublisherKey, Rank, Reason, Refusal, Room, Router,
     ValueDescription, ValueNote,
 };
 pub use busy_poll::BusyPoll;
@@ -58,6 +59,7 @@ pub use observer::Observer;
 pub use port::{Delivery, Execution, LinkState, Port, PortEvent};
 pub use present::Present;
 pub use program::{Carried, Context, Made, Program, run};
+pub use redundancy::RedundancyArguments;
 pub use restart::{restart, stop};
 pub use service::{Service, run_service};
 pub use service_manager::ready;

@@ -74,6 +74,13 @@ pub trait Port: Send + 'static {
         let _one_value = (topic, instance);
     }
 
+    /// Drops the published values that wait on this side or are stored for late joiners, because
+    /// another bridge publishes from this moment on. With `at_once` they are old, and no present
+    /// subscriber may receive them either. Waiting values are reported as [`PortEvent::Lost`].
+    fn drop_waiting(&mut self, at_once: bool) {
+        let _nothing_waits = at_once;
+    }
+
     /// Notes that a call of another program is available or has changed.
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         let _not_served = (topic, description);

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_core::{Application, Local, Owned, Router, Settings};
+use bridge_core::{Application, Local, Owned, Rank, Router, Settings};
 use clap::Parser;
 use mappings::{Mapping, SecurityGroup, SpaceId};
 use tokio::signal::unix::SignalKind;
@@ -32,6 +32,7 @@ use crate::mapping_file::{MappingFile, NodeSetReader, Running};
 use crate::metrics::{self, Requests, Site};
 use crate::observer::Observer;
 use crate::port::Port;
+use crate::redundancy;
 use crate::restart;
 use crate::run::{Fixed, Shell, relay};
 use crate::service;
@@ -82,6 +83,12 @@ pub trait Program: Parser {
     fn owned(mapping: &Mapping) -> Owned {
         let _whole_space = mapping;
         Owned::All
+    }
+
+    /// Returns the rank of the program among the redundant bridges of its spaces; `None` without
+    /// redundancy.
+    fn rank(&self) -> Option<Rank> {
+        None
     }
 
     /// Returns the client of Security Key Services; `None` if the program has none.
@@ -174,12 +181,21 @@ pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCod
     descriptors::raise();
     let arguments = program.arguments();
     let mapping = arguments.mapping.as_deref();
-    let spaces = |mapping: &Mapping| program.spaces(mapping);
+    let mut refused = None;
+    let spaces = |mapping: &Mapping| {
+        let spaces = program.spaces(mapping)?;
+        refused = check_redundancy(&program, mapping, &spaces).err();
+        Ok(spaces)
+    };
     let mapping = match program.made() {
         Ok(Some(Made::Run(made))) => Ok(Some(MappingFile::none(made))),
         Ok(Some(Made::Checked)) => Ok(None),
         Ok(None) => MappingFile::open((mapping, P::NODESETS), arguments.check, spaces),
         Err(failure) => Err(failure),
+    };
+    let mapping = match refused {
+        Some(failure) => Err(failure),
+        None => mapping,
     };
     let ended = match mapping {
         Ok(Some(mapping)) => serve(program, mapping),
@@ -195,6 +211,18 @@ pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCod
     })
 }
 
+/// Checks that a redundant program can carry the mapping.
+fn check_redundancy<P: Program>(
+    program: &P,
+    mapping: &Mapping,
+    spaces: &[SpaceId],
+) -> Result<(), Failure> {
+    match program.rank() {
+        Some(_) => redundancy::check(&program.arguments().flags, mapping, spaces),
+        None => Ok(()),
+    }
+}
+
 fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
     // A single thread: samples pass from the socket to ROS and back without a change of threads,
     // and the state needs no lock.
@@ -206,8 +234,15 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         let arguments = program.arguments();
         let running = file.running().clone();
         let spaces = program.spaces(&running.mapping)?;
+        check_redundancy(&program, &running.mapping, &spaces)?;
         let signal = signals::stopped()?;
         let hangup = signals::listen(SignalKind::hangup())?;
+        let (switch, switches) = watch::channel(0);
+        let switching = signals::count(
+            program.rank().is_some(),
+            SignalKind::user_defined1(),
+            switch,
+        )?;
         let (changed, changes) = watch::channel(running);
         service_manager::start_watchdog();
         let mut requests =
@@ -223,7 +258,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
                 Span::none()
             };
             let requests = requests.pop().unwrap_or_else(metrics::never);
-            let shell = prepare(&program, &changes, (own, several), requests);
+            let shell = prepare(&program, (&changes, &switches), (own, several), requests);
             let shell = shell.instrument(span.clone());
             let ended = shell.await?.run(told(stop.clone()));
             // Run as separate tasks: waking the future given to `block_on` costs a system call each
@@ -236,6 +271,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
             () = signal => {}
             first = shells.join_next() => ended = how(first),
             () = file.follow(hangup, changed) => {}
+            () = switching => {}
         }
         service_manager::ending();
         stopping.send_replace(true);
@@ -252,7 +288,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
 /// Prepares the run loop of a space.
 async fn prepare<P: Program>(
     program: &P,
-    changes: &watch::Receiver<Running>,
+    (changes, switches): (&watch::Receiver<Running>, &watch::Receiver<u64>),
     (own, several): (SpaceId, bool),
     requests: Requests<Status>,
 ) -> Result<Shell<P::Port>, Failure> {
@@ -283,6 +319,9 @@ async fn prepare<P: Program>(
     router.set_owned(P::owned(&mapping), now());
     router.set_relay(relay(carrier.as_ref()));
     router.set_instance(instance()?);
+    if let Some(rank) = program.rank() {
+        router.set_redundancy(rank, now());
+    }
     keys.start(&mapping, &mut router)?;
     router.call_the_roll(now());
     let context = Context {
@@ -319,6 +358,7 @@ async fn prepare<P: Program>(
         claims: P::CLAIMS,
         requests,
         changes: changes.clone(),
+        switches: switches.clone(),
         keys,
         fixed: Fixed {
             started: mapping,

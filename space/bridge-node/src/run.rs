@@ -2,6 +2,7 @@
 
 mod awaited;
 mod calls;
+mod redundancy;
 
 use std::collections::BTreeMap;
 use std::future::poll_fn;
@@ -32,7 +33,7 @@ use crate::metrics::{Requests, Told as _};
 use crate::observer::Observer;
 use crate::policy::NO_SUBSCRIBER;
 use crate::port::{Delivery, Port, PortEvent};
-use crate::status::{Interfaces, Readiness, Status};
+use crate::status::{Interfaces, Readiness, RedundancyStatus, Status};
 
 /// The run loop of one space, with its Router, port and carrier, and the requests for the status.
 pub(crate) struct Shell<P> {
@@ -53,6 +54,8 @@ pub(crate) struct Shell<P> {
     pub(crate) claims: bool,
     pub(crate) requests: Requests<Status>,
     pub(crate) changes: watch::Receiver<Running>,
+    /// The requests of the operator to hand over to a standby.
+    pub(crate) switches: watch::Receiver<u64>,
     pub(crate) keys: KeyRing,
     pub(crate) fixed: Fixed,
     /// The keys of the mapping that take effect at the next start.
@@ -116,6 +119,7 @@ impl<P: Port> Shell<P> {
             self.router.claim(now());
         }
         let mut ended = self.carry(stop, Phase::Running).await;
+        self.hand_over_at_end();
         // Callers are not to wait for calls that are not executed any more.
         self.router.withdraw_all(now());
         while self.drain() {}
@@ -170,15 +174,20 @@ impl<P: Port> Shell<P> {
                 () = &mut stop => return Ok(()),
                 heard = self.carrier.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
                 event = self.port.recv() => more = self.port_events(event).await?,
-                () = timer.as_mut() => self.router.handle_timeout(now()),
+                () = timer.as_mut() => {
+                    self.read_waiting(&mut buffer);
+                    self.router.handle_timeout(now());
+                }
                 _ = looks.tick() => {
                     self.follow_group();
                     self.look_at_held()?;
                     self.port.counted(&self.router);
+                    self.look_at_fitness();
                     self.look_for_peers();
                     self.send_probes();
                 }
                 Ok(()) = self.changes.changed() => self.reload(),
+                Ok(()) = self.switches.changed() => self.switch_over(),
                 Some(NewKeys { group, delivery }) = self.keys.next() => {
                     keys::give(&mut self.router, &group, &delivery);
                 }
@@ -267,6 +276,7 @@ impl<P: Port> Shell<P> {
                     .flatten()
                     .chain(self.taken.values().cloned())
                     .chain(self.keyless())
+                    .chain(self.redundancy_faults())
                     .collect(),
                 waiting_for: self.awaited.reported(),
                 interfaces,
@@ -278,6 +288,7 @@ impl<P: Port> Shell<P> {
         .with_certificate(self.port.certificate())
         .with_pending(self.port.pending())
         .with_carrier(self.carrier.interface(), self.carrier.dropped())
+        .with_redundancy(RedundancyStatus::of(&self.router, now().monotonic))
     }
 
     /// Returns the messages about secured groups without keys.
@@ -350,6 +361,7 @@ impl<P: Port> Shell<P> {
         self.keys.follow(&mapping);
         self.router.set_owned((self.owned)(&mapping), now());
         self.restart = self.fixed.differing(&mapping);
+        self.restart.extend(self.not_redundant(&mapping));
         self.restart.extend(self.port.reload(&mapping, &types));
         if !self.restart.is_empty() {
             warn!(
@@ -503,6 +515,8 @@ impl<P: Port> Shell<P> {
                     }
                     self.router.recycle(bytes);
                 }
+                Output::Heartbeat { bytes } => self.send_heartbeat(bytes),
+                Output::Role(change) => self.tell_role(change),
                 Output::Delivery(delivery) => self.deliver(delivery),
                 Output::Unbound {
                     topic,

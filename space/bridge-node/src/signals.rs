@@ -1,6 +1,7 @@
 //! The signals that end a program.
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::watch;
 
 use crate::exit::{Failure, FailureKind};
 
@@ -15,6 +16,24 @@ pub(crate) fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Fai
             _ = interrupt.recv() => {}
             _ = terminate.recv() => {}
         }
+    })
+}
+
+/// Counts a signal and reports the count. Never completes. The signal keeps its default action if
+/// the program does not listen.
+pub(crate) fn count(
+    listens: bool,
+    kind: SignalKind,
+    counted: watch::Sender<u64>,
+) -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
+    let stream = listens.then(|| listen(kind)).transpose()?;
+    Ok(async move {
+        if let Some(mut stream) = stream {
+            while stream.recv().await.is_some() {
+                counted.send_modify(|count| *count += 1);
+            }
+        }
+        std::future::pending().await
     })
 }
 

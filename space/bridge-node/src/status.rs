@@ -1,5 +1,7 @@
 //! The status of a program: counters per topic and delays per hop, as JSON and for Prometheus.
 
+mod redundancy;
+
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::time::Duration;
@@ -8,6 +10,7 @@ use bridge_core::{CallCounters, Counters, Delays, Hop, Reason, Router};
 use mappings::{SpaceId, Variable};
 use serde::Serialize;
 
+pub(crate) use self::redundancy::RedundancyStatus;
 use crate::mapping_file::About;
 use crate::metrics::Told;
 use crate::port::LinkState;
@@ -45,6 +48,9 @@ pub(crate) struct Status {
     /// The MQTT broker; `None` with UDP.
     #[serde(skip_serializing_if = "Option::is_none")]
     broker: Option<BrokerStatus>,
+    /// The role among the redundant bridges of the space; `None` without redundancy.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    redundancy: Option<RedundancyStatus>,
     /// Datagrams and messages without a topic.
     others: TopicStatus,
     hops: BTreeMap<&'static str, HopStatus>,
@@ -214,6 +220,7 @@ impl Status {
             cancellations_pending: Vec::new(),
             applications: applications(router),
             broker: None,
+            redundancy: None,
             others: router.others().into(),
             hops,
         }
@@ -262,6 +269,11 @@ impl Status {
             address,
             dropped: dropped.into_iter().collect(),
         });
+        self
+    }
+
+    pub(crate) fn with_redundancy(mut self, redundancy: Option<RedundancyStatus>) -> Self {
+        self.redundancy = redundancy;
         self
     }
 
@@ -375,6 +387,9 @@ impl Told for Status {
         for (reason, count) in self.broker.iter().flat_map(|broker| &broker.dropped) {
             let labels = format!("{own},reason=\"{reason}\"");
             line("broker_dropped_total", &labels, count);
+        }
+        if let Some(redundancy) = &self.redundancy {
+            redundancy.figures(&own, &mut line);
         }
         let pending = self.cancellations_pending.len();
         line("cancellations_pending", &own, &pending);

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::pages::{self, Page};
+use super::pages::{self, Page, RedundancyPage, RedundantPeerPage};
 use super::processes::{self, Process};
 use crate::arguments::{Group, StatusArguments};
 use crate::exit::Failure;
@@ -151,6 +151,9 @@ struct Program {
     /// The URL of its status, or its address in the group.
     address: Option<String>,
     pid: Option<u32>,
+    /// The role of a redundant bridge.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    redundancy: Option<RedundancyPage>,
 }
 
 #[derive(Serialize)]
@@ -214,6 +217,7 @@ fn of_page(page: &Page) -> Program {
         mapping_hash: has_mapping.then(|| page.mapping.hash.clone()),
         address: Some(page.url.clone()),
         pid: page.pid,
+        redundancy: page.redundancy.clone(),
     }
 }
 
@@ -230,6 +234,7 @@ fn of_process(process: &Process, space: Option<u16>) -> Program {
         mapping_hash: None,
         address: None,
         pid: Some(process.pid),
+        redundancy: None,
     }
 }
 
@@ -250,6 +255,7 @@ fn of_application((space, from): (u16, SocketAddr), application: &Application) -
         mapping_hash: None,
         address: Some(from.to_string()),
         pid: None,
+        redundancy: None,
     }
 }
 
@@ -264,7 +270,15 @@ impl Program {
         }
     }
 
-    /// Returns a line for each reason and each missing peer.
+    /// Returns the state, with the role of a redundant bridge.
+    fn state_text(&self) -> String {
+        match &self.redundancy {
+            Some(redundancy) => format!("{}, {}", self.word(), redundancy.role),
+            None => self.word().to_owned(),
+        }
+    }
+
+    /// Returns a line for each reason and each missing peer, and a line about the redundancy.
     fn reasons(&self) -> Vec<String> {
         let space = self.space.map(|space| format!(" (space {space})"));
         let who = format!("{}{}", self.program, space.unwrap_or_default());
@@ -273,7 +287,8 @@ impl Program {
             .waiting_for
             .iter()
             .map(|peer| format!("waiting for {peer}"));
-        let mut lines: Vec<String> = not_ready.chain(waiting).collect();
+        let redundancy = self.redundancy.iter().map(told);
+        let mut lines: Vec<String> = not_ready.chain(waiting).chain(redundancy).collect();
         if self.state == State::Running {
             lines.push("no status: start it with --metrics 127.0.0.1:PORT to see more".to_owned());
         }
@@ -282,6 +297,49 @@ impl Program {
             .map(|line| wrapped(&format!("  {}: ", harmless(&who)), &harmless(&line)))
             .collect()
     }
+}
+
+/// Describes the role of a redundant bridge.
+fn told(redundancy: &RedundancyPage) -> String {
+    let RedundancyPage {
+        role,
+        rank,
+        epoch,
+        cut_off,
+        rivals,
+        last_takeover,
+        peers,
+    } = redundancy;
+    let mut text = format!("{role}, rank {rank}, epoch {epoch}");
+    if *cut_off {
+        text.push_str(", the group is out of reach");
+    }
+    for peer in peers {
+        let RedundantPeerPage {
+            rank,
+            role,
+            address,
+            age_ms,
+        } = peer;
+        text.push_str(&match age_ms {
+            0..1_000 => format!("; rank {rank} at {address} is {role}"),
+            _ => format!("; rank {rank} at {address} is lost"),
+        });
+    }
+    if peers.is_empty() {
+        text.push_str("; no other bridge of the space: nothing takes over");
+    }
+    if let Some(last) = last_takeover {
+        let ago = uptime(last.seconds_ago);
+        text.push_str(&format!(
+            "; became active {ago} ago, because {}",
+            last.reason
+        ));
+    }
+    if *rivals > 0 {
+        text.push_str(&format!("; {rivals} times with another active bridge"));
+    }
+    text
 }
 
 const HEAD: [&str; 7] = [
@@ -297,7 +355,7 @@ fn table(programs: &[Program]) -> Table {
         table.row([
             one.program.clone(),
             one.space.map_or_else(dash, |space| space.to_string()),
-            one.word().to_owned(),
+            one.state_text(),
             one.version.clone().unwrap_or_else(dash),
             one.uptime_s.map_or_else(dash, uptime),
             hash.unwrap_or_else(dash),
@@ -324,6 +382,7 @@ const NOBODY: &str = "no program of a cell runs on this host or announces itself
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cell::pages::TakeoverPage;
 
     fn application(name: &str) -> Application {
         Application {
@@ -379,6 +438,45 @@ mod tests {
         assert_eq!(
             reasons,
             ["  bridge-ros1 (space 1): not ready: no ROS master\n"]
+        );
+    }
+
+    #[test]
+    fn a_redundant_bridge_is_shown_with_its_role_and_peers() {
+        let peer = |rank, role: &str, age_ms| RedundantPeerPage {
+            rank,
+            role: role.to_owned(),
+            address: format!("10.0.0.{rank}:4000"),
+            age_ms,
+        };
+        let page = Page {
+            program: "bridge-ros1".to_owned(),
+            space: 1,
+            redundancy: Some(RedundancyPage {
+                role: "active".to_owned(),
+                rank: 1,
+                epoch: 3,
+                last_takeover: Some(TakeoverPage {
+                    reason: "the active bridge was lost".to_owned(),
+                    seconds_ago: 5,
+                }),
+                peers: vec![peer(2, "standby", 12), peer(3, "standby", 4_000)],
+                ..RedundancyPage::default()
+            }),
+            ..Page::default()
+        };
+        let shown = of_page(&page);
+        assert_eq!(shown.state_text(), "ready, active");
+        let line = shown
+            .reasons()
+            .concat()
+            .split_whitespace()
+            .collect::<Vec<_>>()
+            .join(" ");
+        assert_eq!(
+            line,
+            "bridge-ros1 (space 1): active, rank 1, epoch 3; rank 2 at 10.0.0.2:4000 is standby; rank 3 at \
+             10.0.0.3:4000 is lost; became active 5 s ago, because the active bridge was lost"
         );
     }
 

@@ -29,12 +29,43 @@ pub(crate) struct Page {
     pub(crate) certificate: Option<CertificatePage>,
     pub(crate) servers: Vec<ServerPage>,
     pub(crate) hops: BTreeMap<String, HopPage>,
+    pub(crate) redundancy: Option<RedundancyPage>,
     /// The address of the page.
     #[serde(skip_deserializing)]
     pub(crate) url: String,
     /// The process that serves the page, if it runs on this host.
     #[serde(skip_deserializing)]
     pub(crate) pid: Option<u32>,
+}
+
+/// The role of a bridge among the redundant bridges of its space.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(default)]
+pub(crate) struct RedundancyPage {
+    pub(crate) role: String,
+    pub(crate) rank: u8,
+    pub(crate) epoch: u32,
+    pub(crate) cut_off: bool,
+    pub(crate) rivals: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) last_takeover: Option<TakeoverPage>,
+    pub(crate) peers: Vec<RedundantPeerPage>,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(default)]
+pub(crate) struct TakeoverPage {
+    pub(crate) reason: String,
+    pub(crate) seconds_ago: u64,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(default)]
+pub(crate) struct RedundantPeerPage {
+    pub(crate) rank: u8,
+    pub(crate) role: String,
+    pub(crate) address: String,
+    pub(crate) age_ms: u64,
 }
 
 #[derive(Debug, Clone, Default, PartialEq, Deserialize, Serialize)]

@@ -161,7 +161,8 @@ impl Router {
             return true;
         }
         let confirmer = self.confirmers.get_mut(&space);
-        if !confirmer.is_some_and(|of| of.counts(from, now.monotonic)) {
+        let counts = confirmer.is_some_and(|of| of.counts(from, now.monotonic));
+        if !counts && !self.is_active_sender(space, from) {
             // The announcement of the bridge may have been lost.
             self.ask_applications(now);
             let cause = (Reason::Forged, "confirmation");

@@ -289,7 +289,9 @@ impl Router {
                 Err(error) => self.drop_undecoded(None, from, &error),
             }
         } else if space == self.settings.own && (self.owned == Owned::All || self.is_source(from)) {
-            self.drop_own(None, from, now);
+            if !self.follow_peer(message, None, from, now) {
+                self.drop_own(None, from, now);
+            }
         } else if message.is_chunk() && !message.is_sealed() {
             self.handle_chunk(message, (space, 0), from, now);
         } else {

@@ -134,7 +134,7 @@ impl Router {
             Output::Datagram { topic, bytes, .. } | Output::Action { topic, bytes } => {
                 (bytes, Some(*topic))
             }
-            Output::Discovery { bytes } => (bytes, None),
+            Output::Discovery { bytes } | Output::Heartbeat { bytes } => (bytes, None),
             _ => return Some(output),
         };
         let mut sealed = self.spare.pop().unwrap_or_default();
@@ -164,6 +164,7 @@ impl Router {
                         },
                     ),
                     Output::Discovery { bytes } => (bytes, Output::Discovery { bytes: sealed }),
+                    Output::Heartbeat { bytes } => (bytes, Output::Heartbeat { bytes: sealed }),
                     other => (sealed, other),
                 };
                 self.recycle(clear);

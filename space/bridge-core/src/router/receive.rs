@@ -10,7 +10,9 @@ use uadp::{
 };
 
 use super::content::Quality;
+use super::redundant::precedes;
 use super::{About, Router, late};
+use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::fields;
 use crate::hops::Hop;
@@ -45,7 +47,7 @@ impl Router {
         if let Some((case, detail)) = late {
             return self.count(About::sender(from), late::cause(case), 1, || detail);
         }
-        if self.is_for_all(message, from, now) {
+        if self.is_for_all(message, from, now) || self.is_heartbeat(message, from, now) {
             return;
         }
         let Some(space) = self.space_of(&header, from) else {
@@ -53,6 +55,9 @@ impl Router {
         };
         if message.message_type() != NetworkMessageType::DataSet {
             self.handle_discovery(message, (space, from), now);
+            return;
+        }
+        if self.is_superseded(space, from, now) {
             return;
         }
         if message.is_action() {
@@ -76,6 +81,7 @@ impl Router {
                         )
                     });
                 }
+                _ if self.follow_peer(message, namespace, from, now) => {}
                 _ => self.drop_own(namespace, from, now),
             }
             return;
@@ -205,6 +211,7 @@ impl Router {
         place.by_clients = topic.space == SpaceId::UA;
         let local = self.settings.local;
         let relay = self.relay;
+        let took_over = self.took_over();
         let Some(Topic {
             role: Role::Theirs(reader),
             counters,
@@ -236,6 +243,17 @@ impl Router {
             }
         };
         let is_confirmed = confirming.is_some();
+        if let Some(took_over) = took_over
+            && let Some(Ok(_)) = &admitted
+            && precedes(
+                took_over,
+                &place,
+                (*lasting, confirming.as_deref().map(Confirming::within)),
+                now,
+            )
+        {
+            admitted = Some(Err(Reason::Takeover));
+        }
         if let Some(Ok(admitted)) = &admitted {
             counters.missing += u64::from(admitted.missing);
         }

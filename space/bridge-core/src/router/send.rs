@@ -14,13 +14,22 @@ impl Router {
     /// Returns the next output, topic by topic in turn. `None`: no output until the next
     /// `handle_*`.
     pub fn poll_output(&mut self, now: Now) -> Option<Output> {
+        self.check_lease(now);
         loop {
             let output = self.next_output(now)?;
+            if self.redundant.is_some() && self.mutes(&output) {
+                self.drop_muted(output);
+                continue;
+            }
             if self.guard.is_none() {
                 return Some(output);
             }
+            let is_heartbeat = matches!(output, Output::Heartbeat { .. });
             if let Some(output) = self.sealed(output) {
                 return Some(output);
+            }
+            if is_heartbeat {
+                self.heartbeat_not_sealed(now);
             }
         }
     }
@@ -91,6 +100,9 @@ impl Router {
     fn take_turn(&mut self, topic: TopicId, now: Now) -> Option<Output> {
         if self.claims.is_some() && self.is_withheld(topic) {
             self.withhold(topic);
+            return None;
+        }
+        if self.redundant.is_some() && self.mute_topic(topic, now) {
             return None;
         }
         let entry = self.topics.get_mut(&topic)?;

@@ -200,6 +200,7 @@ impl Cell {
             match output {
                 Output::Datagram { bytes, .. }
                 | Output::Discovery { bytes }
+                | Output::Heartbeat { bytes }
                 | Output::Action { bytes, .. } => {
                     for _ in 0..(self.copies)(&bytes) {
                         let delay = (self.delay)();

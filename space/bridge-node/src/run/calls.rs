@@ -3,7 +3,9 @@
 
 use std::sync::Arc;
 
-use bridge_core::{CallDescription, CallMap, Executed, OfferedType, Output, Refusal};
+use bridge_core::{
+    AskError, AskErrorKind, CallDescription, CallMap, Executed, OfferedType, Output, Refusal,
+};
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::ServiceType;
@@ -22,6 +24,9 @@ impl<P: Port> Shell<P> {
         reason = "all others are taken in by who hands these on"
     )]
     pub(super) fn call_event(&mut self, event: PortEvent) {
+        if self.router.redundancy().is_some() {
+            return self.refuse_call_event(event);
+        }
         match event {
             PortEvent::Described { topic, description } => {
                 self.router.describe_value(topic, description, now());
@@ -55,6 +60,33 @@ impl<P: Port> Shell<P> {
             PortEvent::Withdrawn { topic } => self.router.withdraw(topic, now()),
             PortEvent::Executed { execution, outcome } => {
                 self.router.executed(execution, outcome, now());
+            }
+            _ => {}
+        }
+    }
+
+    /// Refuses the events of the port that concern calls: redundant bridges do not carry calls,
+    /// because a request in flight at a takeover could be executed twice.
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "all others concern calls and have no response"
+    )]
+    fn refuse_call_event(&mut self, event: PortEvent) {
+        match event {
+            PortEvent::Described { topic, description } => {
+                self.router.describe_value(topic, description, now());
+            }
+            PortEvent::Withdrawn { topic } => self.router.withdraw(topic, now()),
+            PortEvent::Ask { ask, topic, .. } => {
+                let error = AskError {
+                    kind: AskErrorKind::Refused,
+                    status: Refusal::NotExecutable.status_code(),
+                    text: NO_CALLS.to_owned(),
+                };
+                self.port.answered(ask, topic, Err(error));
+            }
+            PortEvent::Offer { topic, .. } | PortEvent::OfferTyped { topic, .. } => {
+                warn!(%topic, "not executed for the space: {NO_CALLS}");
             }
             _ => {}
         }
@@ -116,6 +148,10 @@ impl<P: Port> Shell<P> {
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        if self.router.redundancy().is_some() {
+            debug!(%topic, "a call is not offered on the local side: {NO_CALLS}");
+            return;
+        }
         debug!(%topic, name = description.name, "another program offers a call");
         self.observe(|observer| observer.call_known(topic, description));
         self.port.call_known(topic, description);
@@ -167,3 +203,7 @@ impl<P: Port> Shell<P> {
         self.port.taken(namespace, by);
     }
 }
+
+/// The reason why a redundant bridge carries no calls, as text for the user.
+const NO_CALLS: &str =
+    "redundant bridges do not carry calls and actions; start a bridge without --rank for them";

@@ -1,0 +1,734 @@
+//! Redundant bridges of a space: a single bridge is active, the others are ready to take over.
+//!
+//! Each bridge sends a [`Heartbeat`] every 20 ms to the group. The active bridge sends values
+//! to both sides. A standby receives everything and sends nothing but heartbeats. It becomes active
+//! when it misses the heartbeats of the active bridge, with a higher epoch.
+//!
+//! The active bridge holds a lease: it may send while its last heartbeat is at most 70 ms old,
+//! which is shorter than the time after which a standby takes over. A process that was
+//! stopped therefore mutes itself before its next message. A standby does not count the time for
+//! which it did not run itself, because heartbeats may wait in its socket.
+//!
+//! The module has no clock and no socket: times are inputs, and [`Redundancy::due`] returns the
+//! time of the next [`poll`](Redundancy::poll).
+
+mod heartbeat;
+
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+pub use self::heartbeat::Heartbeat;
+use crate::settings::Now;
+
+/// The rank of a bridge among the redundant bridges of its space; 1 takes over first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Rank(u8);
+
+impl Rank {
+    /// The highest rank. It bounds the time of a takeover.
+    pub const MOST: u8 = 3;
+
+    /// Returns `None` unless the number is 1 to [`MOST`](Self::MOST).
+    #[must_use]
+    pub const fn new(number: u8) -> Option<Self> {
+        if number == 0 || number > Self::MOST {
+            return None;
+        }
+        Some(Self(number))
+    }
+
+    /// Returns the number.
+    #[must_use]
+    pub const fn get(self) -> u8 {
+        self.0
+    }
+
+    /// Returns the time for which a bridge listens at its start.
+    fn listening(self) -> Duration {
+        LISTENED + STARTED_LATER * (u32::from(self.0) - 1)
+    }
+}
+
+/// The role of a redundant bridge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Role {
+    /// It listens for an active bridge after its start.
+    Starting,
+    /// It follows the active bridge and sends no values.
+    Standby,
+    /// It sends values.
+    Active,
+}
+
+impl Role {
+    /// Returns the role in lower case.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Starting => "starting",
+            Self::Standby => "standby",
+            Self::Active => "active",
+        }
+    }
+
+    const fn number(self) -> u8 {
+        match self {
+            Self::Starting => 0,
+            Self::Standby => 1,
+            Self::Active => 2,
+        }
+    }
+
+    const fn of(number: u8) -> Option<Self> {
+        match number {
+            0 => Some(Self::Starting),
+            1 => Some(Self::Standby),
+            2 => Some(Self::Active),
+            _ => None,
+        }
+    }
+}
+
+/// The cause of a takeover.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TakeoverCause {
+    /// No other bridge was active at the start.
+    Start,
+    /// The heartbeats of the active bridge were missed.
+    Lost,
+    /// The active bridge has handed over, as for an upgrade.
+    Released,
+    /// This bridge was active before, and no other bridge has taken over.
+    Resumed,
+}
+
+impl TakeoverCause {
+    /// Returns the cause as text for the user.
+    #[must_use]
+    pub const fn text(self) -> &'static str {
+        match self {
+            Self::Start => "no other bridge was active at the start",
+            Self::Lost => "the active bridge was lost",
+            Self::Released => "the active bridge handed over",
+            Self::Resumed => "no other bridge took over",
+        }
+    }
+}
+
+/// The cause for which an active bridge stops sending values.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MuteCause {
+    /// The process did not run for longer than the lease, or its clock jumped.
+    Stalled,
+    /// Another bridge is active with a higher epoch.
+    Outranked,
+    /// The operator or the end of the program hands over.
+    Released,
+    /// The ROS side is out of reach, and a standby reaches it.
+    Unfit,
+    /// The group was out of reach and is back: another bridge may be active.
+    Reconnected,
+    /// There are no keys for the heartbeat.
+    NoKeys,
+}
+
+impl MuteCause {
+    /// Returns the cause as text for the user.
+    #[must_use]
+    pub const fn text(self) -> &'static str {
+        match self {
+            Self::Stalled => "the process did not run for longer than its lease",
+            Self::Outranked => "another bridge is active with a higher epoch",
+            Self::Released => "it hands over",
+            Self::Unfit => "its ROS side is out of reach, and the standby reaches it",
+            Self::Reconnected => "the group was out of reach",
+            Self::NoKeys => "there are no keys for the heartbeat",
+        }
+    }
+}
+
+/// A change of the redundancy of a bridge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RoleChange {
+    /// This bridge is active.
+    TookOver {
+        /// The cause.
+        cause: TakeoverCause,
+        /// The new epoch.
+        epoch: u32,
+        /// The time since the last heartbeat of the active bridge; `None` at the start.
+        gap: Option<Duration>,
+    },
+    /// This bridge is a standby and follows an active bridge.
+    Follows {
+        /// The rank of the active bridge.
+        rank: Rank,
+        /// The address of the active bridge.
+        from: SocketAddr,
+    },
+    /// This bridge was active and sends no values any more.
+    Muted {
+        /// The cause.
+        cause: MuteCause,
+    },
+    /// Another bridge was active at the same time.
+    Rival {
+        /// The rank of the other bridge.
+        rank: Rank,
+        /// The address of the other bridge.
+        from: SocketAddr,
+    },
+    /// Another bridge has the same rank.
+    SameRank {
+        /// The address of the other bridge.
+        from: SocketAddr,
+    },
+    /// The group is out of reach while this bridge is active.
+    CutOff,
+}
+
+/// A request to switch over that cannot be fulfilled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum SwitchRefusal {
+    /// This bridge is not active.
+    #[error("this bridge is not the active one; send the request to the active bridge")]
+    NotActive,
+    /// No standby is ready.
+    #[error("no standby was received for the time of a takeover; start one with another --rank")]
+    NoStandby,
+}
+
+/// Another bridge of the space.
+#[derive(Debug, Clone, Copy)]
+pub struct RedundantPeer {
+    heartbeat: Heartbeat,
+    from: SocketAddr,
+    heard: Instant,
+}
+
+impl RedundantPeer {
+    /// Returns the rank.
+    #[must_use]
+    pub const fn rank(&self) -> Rank {
+        self.heartbeat.rank
+    }
+
+    /// Returns the role.
+    #[must_use]
+    pub const fn role(&self) -> Role {
+        self.heartbeat.role
+    }
+
+    /// Returns the epoch.
+    #[must_use]
+    pub const fn epoch(&self) -> u32 {
+        self.heartbeat.epoch
+    }
+
+    /// Returns whether the ROS side of the peer is within reach.
+    #[must_use]
+    pub const fn is_fit(&self) -> bool {
+        self.heartbeat.is_fit
+    }
+
+    /// Returns the address.
+    #[must_use]
+    pub const fn from(&self) -> SocketAddr {
+        self.from
+    }
+
+    /// Returns the time since the last heartbeat.
+    #[must_use]
+    pub fn age(&self, now: Instant) -> Duration {
+        now.saturating_duration_since(self.heard)
+    }
+
+    fn is_present(&self, now: Instant) -> bool {
+        self.age(now) < PRESENT
+    }
+}
+
+/// The number of events since the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RedundancyCounts {
+    /// Takeovers by this bridge.
+    pub takeovers: u64,
+    /// Times at which this bridge muted itself, because it did not run for longer than its lease.
+    pub stalls: u64,
+    /// Times at which another bridge was active at once. Values may have been doubled then.
+    pub rivals: u64,
+}
+
+/// The last takeover by this bridge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Takeover {
+    /// The cause.
+    pub cause: TakeoverCause,
+    /// The time of the takeover.
+    pub at: Instant,
+    /// The time since the last heartbeat of the bridge that was active before.
+    pub gap: Option<Duration>,
+}
+
+/// The state of a redundant bridge.
+#[derive(Debug)]
+pub struct Redundancy {
+    rank: Rank,
+    instance: u32,
+    role: Role,
+    epoch: u32,
+    is_fit: bool,
+    /// The number of heartbeats with a ROS side out of reach.
+    unfit: u32,
+    /// Whether this bridge has handed over and no other bridge was active since.
+    is_released: bool,
+    /// Whether the group is out of reach while this bridge is active.
+    is_cut: bool,
+    /// The time of the next heartbeat.
+    next: Instant,
+    /// The time of the last heartbeat that was sent.
+    leased: Instant,
+    /// The last readings of both clocks.
+    seen: Now,
+    /// The time at which this bridge takes over, unless it receives an active bridge before.
+    deadline: Instant,
+    /// The cause of the next takeover.
+    cause: TakeoverCause,
+    /// The instance of the active bridge that is followed.
+    followed: Option<u32>,
+    /// The last heartbeat of an active bridge, including this bridge.
+    active_at: Option<Instant>,
+    peers: Vec<RedundantPeer>,
+    counts: RedundancyCounts,
+    last: Option<Takeover>,
+}
+
+impl Redundancy {
+    /// Creates the state of a bridge that starts. `instance` distinguishes the bridges of a space.
+    #[must_use]
+    pub fn new(rank: Rank, instance: u32, now: Now) -> Self {
+        Self {
+            rank,
+            instance,
+            role: Role::Starting,
+            epoch: 0,
+            is_fit: true,
+            unfit: 0,
+            is_released: false,
+            is_cut: false,
+            next: now.monotonic,
+            leased: now.monotonic,
+            seen: now,
+            deadline: now.monotonic + rank.listening(),
+            cause: TakeoverCause::Start,
+            followed: None,
+            active_at: None,
+            peers: Vec::new(),
+            counts: RedundancyCounts::default(),
+            last: None,
+        }
+    }
+
+    /// Returns the rank of this bridge.
+    #[must_use]
+    pub const fn rank(&self) -> Rank {
+        self.rank
+    }
+
+    /// Returns the role of this bridge.
+    #[must_use]
+    pub const fn role(&self) -> Role {
+        self.role
+    }
+
+    /// Returns the epoch, which increases with each takeover.
+    #[must_use]
+    pub const fn epoch(&self) -> u32 {
+        self.epoch
+    }
+
+    /// Returns the counts since the start.
+    #[must_use]
+    pub const fn counts(&self) -> RedundancyCounts {
+        self.counts
+    }
+
+    /// Returns the last takeover by this bridge.
+    #[must_use]
+    pub const fn last_takeover(&self) -> Option<Takeover> {
+        self.last
+    }
+
+    /// Returns the other bridges that were received within the last seconds.
+    pub fn peers(&self, now: Instant) -> impl Iterator<Item = &RedundantPeer> {
+        let shown = move |peer: &&RedundantPeer| peer.age(now) < FORGOTTEN;
+        self.peers.iter().filter(shown)
+    }
+
+    /// Returns whether another present bridge has the rank of this bridge.
+    #[must_use]
+    pub fn has_double(&self, now: Instant) -> bool {
+        let double = |peer: &RedundantPeer| peer.rank() == self.rank && peer.is_present(now);
+        self.peers.iter().any(double)
+    }
+
+    /// Returns whether nothing may be sent to the group.
+    #[must_use]
+    pub fn mutes_group(&self) -> bool {
+        self.role != Role::Active || self.is_cut
+    }
+
+    /// Returns whether nothing may be published on the local side.
+    #[must_use]
+    pub fn mutes_local(&self) -> bool {
+        self.role != Role::Active
+    }
+
+    /// Returns whether the group is out of reach while this bridge is active.
+    #[must_use]
+    pub const fn is_cut(&self) -> bool {
+        self.is_cut
+    }
+
+    /// Returns whether the address belongs to another bridge of the space.
+    pub(crate) fn is_peer(&self, from: SocketAddr) -> bool {
+        self.peers.iter().any(|peer| peer.from == from)
+    }
+
+    /// Returns whether the address belongs to the followed active bridge.
+    pub(crate) fn is_followed(&self, from: SocketAddr) -> bool {
+        let followed = |peer: &RedundantPeer| {
+            peer.from == from && Some(peer.heartbeat.instance) == self.followed
+        };
+        self.role != Role::Active && self.peers.iter().any(followed)
+    }
+
+    /// Returns the time of the next [`poll`](Self::poll).
+    #[must_use]
+    pub fn due(&self) -> Instant {
+        match self.role {
+            Role::Active => self.next,
+            Role::Starting | Role::Standby => self.next.min(self.deadline),
+        }
+    }
+
+    /// Sets whether the ROS side is within reach.
+    pub const fn set_fit(&mut self, is_fit: bool) {
+        self.is_fit = is_fit;
+    }
+
+    /// Checks the lease. Call it before each message that is sent: an active bridge that did not
+    /// run, or with a clock that jumped, is muted.
+    pub fn check(&mut self, now: Now) -> Option<RoleChange> {
+        let seen = std::mem::replace(&mut self.seen, now);
+        if self.role != Role::Active {
+            let stopped = now.monotonic.saturating_duration_since(seen.monotonic);
+            if stopped > TOLERATED {
+                self.deadline = (self.deadline + stopped).max(now.monotonic + QUIET);
+            }
+            return None;
+        }
+        let passed = now.monotonic.saturating_duration_since(seen.monotonic);
+        let idle = match self.is_cut {
+            // It sends no heartbeats.
+            true => passed,
+            false => now.monotonic.saturating_duration_since(self.leased),
+        };
+        let told = now.utc.unix_nanos() - seen.utc.unix_nanos();
+        let jumped = told - i128::try_from(passed.as_nanos()).unwrap_or(i128::MAX);
+        let lease = i128::try_from(LEASE.as_nanos()).unwrap_or(i128::MAX);
+        if idle <= LEASE && jumped <= lease {
+            return None;
+        }
+        self.counts.stalls += 1;
+        let alone = idle < ALONE
+            && jumped <= lease
+            && !self
+                .peers
+                .iter()
+                .any(|peer| peer.age(now.monotonic) < FORGOTTEN);
+        let patience = match alone {
+            true => QUIET,
+            false => PATIENCE + STALLED,
+        };
+        Some(self.mute(MuteCause::Stalled, patience, now))
+    }
+
+    /// Advances to `now`: returns the heartbeat to send, if it is due, and the change of the role.
+    /// Report the heartbeat with [`sent`](Self::sent) or [`not_sent`](Self::not_sent).
+    pub fn poll(&mut self, now: Now) -> (Option<Heartbeat>, Option<RoleChange>) {
+        let change = match self.role {
+            Role::Starting | Role::Standby if now.monotonic >= self.deadline => {
+                self.next = now.monotonic;
+                Some(self.take_over(now))
+            }
+            Role::Active if now.monotonic >= self.next => self.look_at_sides(now),
+            Role::Starting | Role::Standby | Role::Active => None,
+        };
+        if now.monotonic < self.next {
+            return (None, None);
+        }
+        // Missed heartbeats are not made up for.
+        self.next = now.monotonic + PERIOD;
+        (Some(self.heartbeat()), change)
+    }
+
+    /// Returns the heartbeat of this bridge.
+    #[must_use]
+    pub const fn heartbeat(&self) -> Heartbeat {
+        Heartbeat {
+            rank: self.rank,
+            role: self.role,
+            epoch: self.epoch,
+            instance: self.instance,
+            is_fit: self.is_fit,
+            is_released: self.is_released,
+        }
+    }
+
+    /// Records that a heartbeat was sent.
+    pub fn sent(&mut self, now: Now) -> Option<RoleChange> {
+        if self.role == Role::Active && self.is_cut {
+            // Another bridge may have taken over in the meantime.
+            return Some(self.mute(MuteCause::Reconnected, PATIENCE + STALLED, now));
+        }
+        self.leased = now.monotonic;
+        if self.role == Role::Active {
+            self.active_at = Some(now.monotonic);
+        }
+        None
+    }
+
+    /// Records that the network did not take a heartbeat. A standby that is cut off does not take
+    /// over. The active bridge stays responsible for its local side.
+    pub fn not_sent(&mut self, now: Now) -> Option<RoleChange> {
+        self.deadline = now.monotonic + PATIENCE + STALLED;
+        let is_new = self.role == Role::Active && !self.is_cut;
+        self.is_cut |= is_new;
+        is_new.then_some(RoleChange::CutOff)
+    }
+
+    /// Records that there were no keys for a heartbeat.
+    pub fn not_sealed(&mut self, now: Now) -> Option<RoleChange> {
+        self.deadline = now.monotonic + self.rank.listening();
+        let was_active = self.role == Role::Active;
+        was_active.then(|| self.mute(MuteCause::NoKeys, self.rank.listening(), now))
+    }
+
+    /// Handles the heartbeat of another bridge of the space.
+    pub fn hear(&mut self, heartbeat: Heartbeat, from: SocketAddr, now: Now) -> Option<RoleChange> {
+        if heartbeat.instance == self.instance {
+            return None;
+        }
+        // A bridge that was stopped is no rival of the bridge that took over.
+        let muted = self.check(now);
+        let change = self.hear_other(heartbeat, from, now);
+        muted.or(change)
+    }
+
+    fn hear_other(
+        &mut self,
+        heartbeat: Heartbeat,
+        from: SocketAddr,
+        now: Now,
+    ) -> Option<RoleChange> {
+        let before = self.meet(heartbeat, from, now.monotonic);
+        if heartbeat.is_active() {
+            return self.hear_active(heartbeat, from, (before, now));
+        }
+        if heartbeat.is_released
+            && self.role != Role::Active
+            && self.followed == Some(heartbeat.instance)
+        {
+            // The former active bridge sends nothing any more; its last values may be under way.
+            self.cause = TakeoverCause::Released;
+            let after = now.monotonic + QUIET + self.turn(now.monotonic);
+            self.deadline = self.deadline.min(after);
+        }
+        let is_new = before.is_none_or(|before| before.rank != self.rank);
+        (is_new && heartbeat.rank == self.rank).then_some(RoleChange::SameRank { from })
+    }
+
+    fn hear_active(
+        &mut self,
+        heartbeat: Heartbeat,
+        from: SocketAddr,
+        (before, now): (Option<Heartbeat>, Now),
+    ) -> Option<RoleChange> {
+        if self.role == Role::Active {
+            if heartbeat.precedence() > self.heartbeat().precedence() {
+                self.counts.rivals += 1;
+                let muted = self.mute(MuteCause::Outranked, PATIENCE, now);
+                self.follow(heartbeat, now);
+                return Some(muted);
+            }
+            let is_new =
+                before.is_none_or(|before| !before.is_active() || before.epoch != heartbeat.epoch);
+            if !is_new {
+                return None;
+            }
+            self.counts.rivals += 1;
+            return Some(RoleChange::Rival {
+                rank: heartbeat.rank,
+                from,
+            });
+        }
+        if heartbeat.epoch < self.epoch {
+            // A bridge that was active before; it mutes itself.
+            return None;
+        }
+        let is_new = self.role == Role::Starting || self.followed != Some(heartbeat.instance);
+        self.follow(heartbeat, now);
+        is_new.then_some(RoleChange::Follows {
+            rank: heartbeat.rank,
+            from,
+        })
+    }
+
+    fn follow(&mut self, heartbeat: Heartbeat, now: Now) {
+        self.role = Role::Standby;
+        self.epoch = heartbeat.epoch;
+        self.followed = Some(heartbeat.instance);
+        self.active_at = Some(now.monotonic);
+        self.is_released = false;
+        self.deadline = now.monotonic + PATIENCE + self.turn(now.monotonic);
+        self.cause = TakeoverCause::Lost;
+    }
+
+    /// Returns the time by which this bridge takes over later than the standbys of lower ranks.
+    fn turn(&self, now: Instant) -> Duration {
+        let before = self.peers.iter().filter(|peer| {
+            peer.role() == Role::Standby && peer.is_present(now) && peer.rank() < self.rank
+        });
+        LATER * u32::try_from(before.count()).unwrap_or(u32::MAX)
+    }
+
+    /// Hands over to a standby.
+    ///
+    /// # Errors
+    /// This bridge is not active, or there is no standby.
+    pub fn switch_over(&mut self, now: Now) -> Result<RoleChange, SwitchRefusal> {
+        if self.role != Role::Active {
+            return Err(SwitchRefusal::NotActive);
+        }
+        if !self.has_standby(false, now.monotonic) {
+            return Err(SwitchRefusal::NoStandby);
+        }
+        Ok(self.release(MuteCause::Released, now))
+    }
+
+    fn release(&mut self, cause: MuteCause, now: Now) -> RoleChange {
+        let muted = self.mute(cause, self.rank.listening(), now);
+        self.is_released = true;
+        self.next = now.monotonic;
+        muted
+    }
+
+    /// Returns whether a standby was received within the time of a takeover.
+    fn has_standby(&self, fit: bool, now: Instant) -> bool {
+        self.peers.iter().any(|peer| {
+            peer.role() == Role::Standby && peer.is_present(now) && (peer.is_fit() || !fit)
+        })
+    }
+
+    /// Hands over if the ROS side is out of reach and a standby reaches it.
+    fn look_at_sides(&mut self, now: Now) -> Option<RoleChange> {
+        self.unfit = match self.is_fit {
+            true => 0,
+            false => self.unfit.saturating_add(1),
+        };
+        let hands_over = self.unfit >= UNFIT && self.has_standby(true, now.monotonic);
+        hands_over.then(|| self.release(MuteCause::Unfit, now))
+    }
+
+    fn take_over(&mut self, now: Now) -> RoleChange {
+        let known = self.peers.iter().map(RedundantPeer::epoch).max();
+        self.role = Role::Active;
+        self.epoch = known.unwrap_or(0).max(self.epoch).saturating_add(1);
+        self.followed = None;
+        self.is_released = false;
+        self.is_cut = false;
+        self.unfit = 0;
+        self.leased = now.monotonic;
+        self.counts.takeovers += 1;
+        let gap = self.active_at;
+        let gap = gap.map(|at| now.monotonic.saturating_duration_since(at));
+        let cause = self.cause;
+        self.last = Some(Takeover {
+            cause,
+            at: now.monotonic,
+            gap,
+        });
+        RoleChange::TookOver {
+            cause,
+            epoch: self.epoch,
+            gap,
+        }
+    }
+
+    fn mute(&mut self, cause: MuteCause, patience: Duration, now: Now) -> RoleChange {
+        self.role = Role::Standby;
+        self.is_cut = false;
+        self.followed = None;
+        self.deadline = now.monotonic + patience;
+        self.cause = TakeoverCause::Resumed;
+        RoleChange::Muted { cause }
+    }
+
+    /// Records a peer. Returns its heartbeat before.
+    fn meet(&mut self, heartbeat: Heartbeat, from: SocketAddr, now: Instant) -> Option<Heartbeat> {
+        let peer = RedundantPeer {
+            heartbeat,
+            from,
+            heard: now,
+        };
+        let known = |peer: &&mut RedundantPeer| peer.heartbeat.instance == heartbeat.instance;
+        if let Some(known) = self.peers.iter_mut().find(known) {
+            return Some(std::mem::replace(known, peer).heartbeat);
+        }
+        self.peers.retain(|peer| peer.age(now) < FORGOTTEN);
+        if self.peers.len() >= MOST_PEERS {
+            let oldest = (0..).zip(&self.peers).min_by_key(|(_, peer)| peer.heard);
+            if let Some(oldest) = oldest.map(|(at, _)| at) {
+                self.peers.remove(oldest);
+            }
+        }
+        self.peers.push(peer);
+        None
+    }
+}
+
+/// The period of the heartbeats.
+const PERIOD: Duration = Duration::from_millis(20);
+/// The time after its last heartbeat for which an active bridge may send.
+const LEASE: Duration = Duration::from_millis(70);
+/// The time after the last heartbeat of the active bridge at which a standby takes over: 5 missed
+/// heartbeats, and longer than the lease.
+const PATIENCE: Duration = Duration::from_millis(100);
+/// The time by which a standby takes over later than a standby of a lower rank: longer than two
+/// heartbeats, of which the last may be lost.
+const LATER: Duration = Duration::from_millis(45);
+/// The further time for which a bridge that was stopped listens for another bridge.
+const STALLED: Duration = Duration::from_millis(60);
+/// The time for which a bridge listens at its start, and by which each further rank listens longer.
+const LISTENED: Duration = Duration::from_millis(300);
+const STARTED_LATER: Duration = Duration::from_millis(100);
+/// The time between a release and the takeover.
+const QUIET: Duration = Duration::from_millis(30);
+/// The longest time between two steps of a bridge that runs.
+const TOLERATED: Duration = Duration::from_millis(30);
+/// The number of heartbeats for which the ROS side is out of reach before a bridge hands over.
+const UNFIT: u32 = 25;
+/// The longest stall after which a bridge without peers resumes at once. A bridge listens longer
+/// at its start.
+const ALONE: Duration = Duration::from_millis(200);
+/// The age of a heartbeat up to which a peer counts as present.
+const PRESENT: Duration = Duration::from_millis(120);
+/// The time after which a peer is forgotten.
+const FORGOTTEN: Duration = Duration::from_secs(10);
+/// The maximum number of known peers. It is limited, because any sender in an unsecured group can
+/// send heartbeats.
+const MOST_PEERS: usize = 8;
+
+#[cfg(test)]
+mod tests;

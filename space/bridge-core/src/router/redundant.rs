@@ -1,0 +1,681 @@
+//! Redundant bridges of the own space: a standby receives everything and sends nothing, and an
+//! active bridge continues where the former active bridge ended.
+
+mod senders;
+
+use std::collections::{BTreeMap, HashMap};
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use mappings::{Lasting, TopicId};
+use uadp::discovery::{Included, Subject};
+use uadp::{MessageKind, NetworkMessage, NetworkMessageType, Timestamp};
+
+pub(super) use self::senders::ActiveSender;
+use super::{About, Router};
+use crate::counters::Reason;
+use crate::output::{Delivery, Kept, Output};
+use crate::place::Place;
+use crate::redundancy::{Heartbeat, Rank, Redundancy, RoleChange, SwitchRefusal};
+use crate::settings::Now;
+use crate::topic::{Item, Role, Topic};
+use crate::writer::{MAX_KEPT, Message};
+
+/// The redundancy of the own space.
+#[derive(Debug)]
+pub(super) struct Redundant {
+    state: Redundancy,
+    /// The states of other spaces that were received while this bridge was muted.
+    held: BTreeMap<TopicId, Vec<HeldState>>,
+    /// The reactions to the loss of a commander that were due while this bridge was muted.
+    losses: BTreeMap<TopicId, (Instant, Delivery)>,
+    /// The number of muted samples of each own topic since the active bridge was last received.
+    unsure: BTreeMap<TopicId, u64>,
+    /// The last message of the active bridge for each own topic with a state.
+    followed: HashMap<TopicId, Followed>,
+    /// The time of the last takeover.
+    took_over: Option<Instant>,
+    /// Samples of the own space that were not sent while this bridge was muted.
+    muted_sent: u64,
+    /// Samples of other spaces that were not published while this bridge was muted.
+    muted_delivered: u64,
+}
+
+/// A state of another space.
+#[derive(Debug)]
+struct HeldState {
+    at: Instant,
+    delivery: Delivery,
+}
+
+/// A message of the active bridge that no own sample equals yet.
+#[derive(Debug)]
+struct Followed {
+    fields: Vec<u8>,
+    stamp: Timestamp,
+}
+
+/// What a muted or active bridge did with samples, for the status.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct MutedSamples {
+    /// Samples of the own space that were not sent to the group.
+    pub sent: u64,
+    /// Samples of other spaces that were not published on the local side.
+    pub delivered: u64,
+}
+
+impl Router {
+    /// Makes this program one of several redundant bridges of its space. It is muted until it takes
+    /// over. Call it after [`set_instance`](Self::set_instance).
+    pub fn set_redundancy(&mut self, rank: Rank, now: Now) {
+        let [.., a, b, c, d] = self.instance;
+        let instance = u32::from_le_bytes([a, b, c, d]);
+        self.redundant = Some(Box::new(Redundant {
+            state: Redundancy::new(rank, instance, now),
+            held: BTreeMap::new(),
+            losses: BTreeMap::new(),
+            unsure: BTreeMap::new(),
+            followed: HashMap::new(),
+            took_over: None,
+            muted_sent: 0,
+            muted_delivered: 0,
+        }));
+    }
+
+    /// Returns the state of the redundancy; `None` for a program without redundancy.
+    #[must_use]
+    pub fn redundancy(&self) -> Option<&Redundancy> {
+        self.redundant.as_ref().map(|redundant| &redundant.state)
+    }
+
+    /// Returns the number of samples that were muted.
+    #[must_use]
+    pub fn muted_samples(&self) -> Option<MutedSamples> {
+        let redundant = self.redundant.as_ref()?;
+        Some(MutedSamples {
+            sent: redundant.muted_sent,
+            delivered: redundant.muted_delivered,
+        })
+    }
+
+    /// Sets whether the local side is within reach.
+    pub fn set_fit(&mut self, is_fit: bool) {
+        if let Some(redundant) = &mut self.redundant {
+            redundant.state.set_fit(is_fit);
+        }
+    }
+
+    /// Hands over to a standby.
+    ///
+    /// # Errors
+    /// This program is not active, or there is no standby.
+    pub fn switch_over(&mut self, now: Now) -> Result<(), SwitchRefusal> {
+        let redundant = self.redundant.as_mut().ok_or(SwitchRefusal::NotActive)?;
+        // The lease may have ended.
+        if let Some(change) = redundant.state.check(now) {
+            self.change_role(change, now);
+            return Err(SwitchRefusal::NotActive);
+        }
+        let change = redundant.state.switch_over(now)?;
+        self.change_role(change, now);
+        self.look_at_redundancy(now);
+        Ok(())
+    }
+
+    /// Records whether the network took the last heartbeat.
+    pub fn heartbeat_sent(&mut self, is_sent: bool, now: Now) {
+        let Some(redundant) = &mut self.redundant else {
+            return;
+        };
+        let change = match is_sent {
+            true => redundant.state.sent(now),
+            false => redundant.state.not_sent(now),
+        };
+        if let Some(change) = change {
+            self.change_role(change, now);
+        }
+    }
+
+    /// Records that there were no keys for a heartbeat.
+    pub(super) fn heartbeat_not_sealed(&mut self, now: Now) {
+        let redundant = self.redundant.as_mut();
+        let change = redundant.and_then(|redundant| redundant.state.not_sealed(now));
+        if let Some(change) = change {
+            self.change_role(change, now);
+        }
+    }
+
+    pub(super) fn redundancy_due(&self) -> Option<Instant> {
+        self.redundant
+            .as_ref()
+            .map(|redundant| redundant.state.due())
+    }
+
+    /// Mutes this program if its lease has ended. Called before each output.
+    pub(super) fn check_lease(&mut self, now: Now) {
+        let redundant = self.redundant.as_mut();
+        if let Some(change) = redundant.and_then(|redundant| redundant.state.check(now)) {
+            self.change_role(change, now);
+        }
+    }
+
+    /// Sends the heartbeat if it is due, and takes over if the active bridge is lost.
+    pub(super) fn look_at_redundancy(&mut self, now: Now) {
+        self.check_lease(now);
+        let Some(redundant) = &mut self.redundant else {
+            return;
+        };
+        let (heartbeat, change) = redundant.state.poll(now);
+        if let Some(change) = change {
+            self.change_role(change, now);
+        }
+        if heartbeat.is_some() {
+            self.send_heartbeat(now);
+        }
+    }
+
+    /// Queues the heartbeat before all other outputs.
+    fn send_heartbeat(&mut self, now: Now) {
+        let mut bytes = self.buffer();
+        let own = self.settings.own;
+        let Some(redundant) = &self.redundant else {
+            return;
+        };
+        let heartbeat = redundant.state.heartbeat();
+        match heartbeat.encode(own, now.utc, &mut bytes) {
+            Ok(()) => self.told.push_front(Output::Heartbeat { bytes }),
+            Err(_) => self.recycle(bytes),
+        }
+    }
+
+    /// Returns whether nothing is sent to the group.
+    pub(super) fn is_muted(&self) -> bool {
+        let redundant = self.redundant.as_ref();
+        redundant.is_some_and(|redundant| redundant.state.mutes_group())
+    }
+
+    /// Returns whether nothing is published on the local side.
+    pub(super) fn is_muted_locally(&self) -> bool {
+        let redundant = self.redundant.as_ref();
+        redundant.is_some_and(|redundant| redundant.state.mutes_local())
+    }
+
+    /// Returns whether an output is dropped, because another bridge sends it. Samples are muted
+    /// where they are polled.
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "all other outputs are for this program"
+    )]
+    pub(super) fn mutes(&mut self, output: &Output) -> bool {
+        match output {
+            Output::Retired { topic, instance } => self.drop_held_states(*topic, Some(*instance)),
+            Output::Silent {
+                topic,
+                silent: true,
+                ..
+            } => self.drop_held_states(*topic, None),
+            _ => {}
+        }
+        if !self.is_muted() {
+            return false;
+        }
+        match output {
+            Output::Action { .. } => true,
+            // Probes are sent, so that a standby learns what the active bridge knows.
+            Output::Discovery { bytes } => !NetworkMessage::decode(bytes)
+                .is_ok_and(|message| message.message_type() == NetworkMessageType::Probe),
+            _ => false,
+        }
+    }
+
+    /// Takes back the buffer of a muted output.
+    pub(super) fn drop_muted(&mut self, output: Output) {
+        if let Output::Action { bytes, .. } | Output::Discovery { bytes } = output {
+            self.recycle(bytes);
+        }
+    }
+
+    /// Handles the heartbeat of a redundant bridge. Returns false for all other messages.
+    pub(super) fn is_heartbeat(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        from: SocketAddr,
+        now: Now,
+    ) -> bool {
+        let Some((space, heartbeat)) = Heartbeat::decode(message) else {
+            return false;
+        };
+        if space != self.settings.own {
+            self.meet_redundant(space, heartbeat, from, now);
+            return true;
+        }
+        let Some(redundant) = &mut self.redundant else {
+            self.drop_own(None, from, now);
+            return true;
+        };
+        let change = redundant.state.hear(heartbeat, from, now);
+        if redundant.state.is_followed(from) && heartbeat.is_active() {
+            redundant.unsure.clear();
+        }
+        if let Some(change) = change {
+            self.change_role(change, now);
+        }
+        true
+    }
+
+    /// Follows a message of the own space from another bridge. Returns false if the sender is no
+    /// redundant bridge of the space.
+    pub(super) fn follow_peer(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        namespace: Option<u16>,
+        from: SocketAddr,
+        now: Now,
+    ) -> bool {
+        let Some(redundant) = &self.redundant else {
+            return false;
+        };
+        if !redundant.state.is_peer(from) {
+            return false;
+        }
+        if message.message_type() != NetworkMessageType::DataSet || message.is_action() {
+            return true;
+        }
+        if !redundant.state.is_followed(from) {
+            if redundant.state.mutes_group() {
+                return true;
+            }
+            let cause = (Reason::Takeover, "rival");
+            self.count(About::sender(from), cause, 1, || {
+                format!("{from} sent a value while this bridge was active: it may be doubled")
+            });
+            return true;
+        }
+        let Some(namespace) = namespace else {
+            return true;
+        };
+        let space = u16::from(self.settings.own.get());
+        if message.is_chunk() {
+            let writer = message.writer_ids().and_then(|mut ids| ids.next());
+            let topic = writer.and_then(|writer| TopicId::new(space, namespace, writer));
+            if let (Some(topic), Ok(chunk)) = (topic, message.chunk()) {
+                let next = chunk.message_sequence_number.wrapping_add(1);
+                self.follow_number(topic, next, None);
+            }
+            return true;
+        }
+        for message in message.messages().filter_map(Result::ok) {
+            let writer = message.writer_id.unwrap_or_default();
+            let Some(topic) = TopicId::new(space, namespace, writer) else {
+                continue;
+            };
+            let header = message.header();
+            let Some(sequence) = header.sequence_number else {
+                continue;
+            };
+            if message.kind == MessageKind::KeepAlive {
+                self.follow_number(topic, sequence, None);
+                continue;
+            }
+            let stamp = header.timestamp.map(|time| Timestamp {
+                time,
+                picoseconds: header.picoseconds.unwrap_or_default(),
+            });
+            self.follow_number(topic, sequence.wrapping_add(1), stamp);
+            if let (Some(stamp), Ok(fields)) = (stamp, message.fields()) {
+                self.follow_state(topic, fields.bytes(), (stamp, now));
+            }
+        }
+        true
+    }
+
+    /// Continues with the sequence number and the time of the active bridge.
+    fn follow_number(&mut self, topic: TopicId, next: u16, stamp: Option<Timestamp>) {
+        // Topics of unknown names are not created: any sender in the group can invent names.
+        if let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.topics.get_mut(&topic)
+        {
+            writer.follow(next, stamp);
+        }
+    }
+
+    /// Takes the stamp of the active bridge for an equal state, so that readers recognise the
+    /// repetitions of this bridge after a takeover.
+    fn follow_state(&mut self, topic: TopicId, fields: &[u8], (stamp, now): (Timestamp, Now)) {
+        let Some(Topic {
+            role: Role::Ours(writer),
+            lasting,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        let Some(redundant) = self
+            .redundant
+            .as_mut()
+            .filter(|_| *lasting != Lasting::Event)
+        else {
+            return;
+        };
+        if writer.adopt(fields, stamp) {
+            redundant.followed.remove(&topic);
+            return;
+        }
+        writer.disown(now.utc);
+        let followed = redundant.followed.entry(topic);
+        let followed = followed.or_insert_with(|| Followed {
+            fields: Vec::new(),
+            stamp,
+        });
+        followed.stamp = stamp;
+        followed.fields.clear();
+        followed.fields.extend_from_slice(fields);
+    }
+
+    /// Takes the stamp of the active bridge for a sample of this muted bridge, if the message of
+    /// the active bridge was received first.
+    pub(super) fn adopt_followed(&mut self, topic: TopicId) {
+        let Some(redundant) = &mut self.redundant else {
+            return;
+        };
+        let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        if let Some(followed) = redundant.followed.get(&topic)
+            && writer.adopt(&followed.fields, followed.stamp)
+        {
+            redundant.followed.remove(&topic);
+        }
+    }
+
+    /// Drops the waiting samples of an own topic, because another bridge sends them.
+    pub(super) fn mute_own(&mut self, topic: TopicId) {
+        let Some(entry) = self.topics.get_mut(&topic) else {
+            return;
+        };
+        entry.ready = false;
+        let mut dropped = u64::from(entry.sending.take().is_some());
+        while let Some(item) = entry.queue.pop() {
+            if let Item::Message(Message::Datagram(encoded)) = item {
+                dropped += u64::from(!encoded.is_keep_alive());
+                self.spare.push(encoded.bytes);
+            } else {
+                dropped += 1;
+            }
+        }
+        self.spare.truncate(super::SPARE_BUFFERS);
+        if let Role::Ours(writer) = &mut entry.role {
+            writer.end_repetitions();
+        }
+        let Some(redundant) = self.redundant.as_mut().filter(|_| dropped > 0) else {
+            return;
+        };
+        if redundant.state.is_cut() {
+            let cause = (Reason::NotSent, "cut off");
+            self.count(About::topic(topic), cause, dropped, || {
+                "the group is out of reach".to_owned()
+            });
+            return;
+        }
+        redundant.muted_sent += dropped;
+        let unsure = redundant.unsure.entry(topic).or_default();
+        *unsure = unsure.saturating_add(dropped);
+    }
+
+    /// Takes a delivery that another bridge publishes. A state is held for a takeover.
+    pub(super) fn mute_delivery(&mut self, delivery: Delivery, now: Now) {
+        let topic = delivery.topic;
+        // The local side has the value from the active bridge.
+        self.is_good(topic, now);
+        let Some(redundant) = &mut self.redundant else {
+            return;
+        };
+        redundant.muted_delivered += 1;
+        redundant.losses.remove(&topic);
+        if !delivery.lasting {
+            self.recycle(delivery.payload);
+            return;
+        }
+        let held = redundant.held.entry(topic).or_default();
+        let is_again = delivery.kept == Kept::Again;
+        if delivery.kept == Kept::Alone {
+            held.clear();
+        }
+        let same = held
+            .iter()
+            .position(|one| one.delivery.instance == delivery.instance);
+        match same {
+            Some(_) if is_again => return,
+            Some(same) => {
+                held.remove(same);
+            }
+            None if held.len() >= MAX_KEPT => {
+                held.remove(0);
+            }
+            None => {}
+        }
+        held.push(HeldState {
+            at: now.monotonic,
+            delivery,
+        });
+    }
+
+    /// Holds the reaction to the loss of a commander for a takeover.
+    pub(super) fn mute_loss(&mut self, delivery: Delivery, now: Now) {
+        if let Some(redundant) = &mut self.redundant {
+            let held = (now.monotonic, delivery);
+            redundant.losses.insert(held.1.topic, held);
+        }
+    }
+
+    /// Drops the held states of a topic that are no current values any more.
+    fn drop_held_states(&mut self, topic: TopicId, instance: Option<Timestamp>) {
+        let Some(redundant) = &mut self.redundant else {
+            return;
+        };
+        match (instance, redundant.held.get_mut(&topic)) {
+            (Some(_), Some(held)) => held.retain(|one| one.delivery.instance != instance),
+            (None, Some(_)) => {
+                redundant.held.remove(&topic);
+            }
+            (_, None) => {}
+        }
+    }
+
+    /// Returns the time of the last takeover, as long as this program is active.
+    pub(super) fn took_over(&self) -> Option<Instant> {
+        self.redundant.as_ref()?.took_over
+    }
+
+    fn change_role(&mut self, change: RoleChange, now: Now) {
+        match change {
+            RoleChange::TookOver { gap, .. } => self.unmute(gap, now),
+            RoleChange::Muted { .. } => self.mute_all(now),
+            RoleChange::CutOff
+            | RoleChange::Follows { .. }
+            | RoleChange::Rival { .. }
+            | RoleChange::SameRank { .. } => {}
+        }
+        self.tell(Output::Role(change));
+    }
+
+    /// Empties all queues.
+    fn mute_all(&mut self, now: Now) {
+        if let Some(redundant) = &mut self.redundant {
+            redundant.followed.clear();
+            redundant.unsure.clear();
+            redundant.took_over = None;
+        }
+        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        for topic in topics {
+            self.mute_topic(topic, now);
+        }
+        self.paced.clear();
+        // A heartbeat that was made before is outdated.
+        self.told.retain(|told| {
+            !matches!(
+                told,
+                Output::CommanderLost { .. } | Output::Heartbeat { .. }
+            )
+        });
+    }
+
+    /// Empties the queue of a topic if it is muted. Returns false if it is not muted.
+    pub(super) fn mute_topic(&mut self, topic: TopicId, now: Now) -> bool {
+        if self.is_home(topic) {
+            let is_muted = self.is_muted();
+            if is_muted {
+                self.mute_own(topic);
+            }
+            return is_muted;
+        }
+        if !self.is_muted_locally() {
+            return false;
+        }
+        while let Some(item) = self.topics.get_mut(&topic).and_then(|of| of.queue.pop()) {
+            if let Item::Delivery(delivery) = item {
+                self.mute_delivery(delivery, now);
+            }
+        }
+        if let Some(entry) = self.topics.get_mut(&topic) {
+            entry.ready = false;
+        }
+        true
+    }
+
+    /// Continues where the former active bridge ended. `gap` is the time since its last heartbeat.
+    fn unmute(&mut self, gap: Option<Duration>, now: Now) {
+        let Some(redundant) = &mut self.redundant else {
+            return;
+        };
+        redundant.took_over = Some(now.monotonic);
+        redundant.followed.clear();
+        let held = std::mem::take(&mut redundant.held);
+        let losses = std::mem::take(&mut redundant.losses);
+        let unsure = std::mem::take(&mut redundant.unsure);
+        // The former active bridge was received at this time, and its next heartbeat was missed.
+        let unsure_since = gap.and_then(|gap| now.monotonic.checked_sub(gap));
+        let is_unsure = |at: Instant| unsure_since.is_none_or(|since| at >= since);
+        for (topic, count) in unsure {
+            let cause = (Reason::Takeover, "gap");
+            self.count_only(About::topic(topic), cause, count, String::new);
+        }
+        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        for topic in topics {
+            self.continue_own(topic, now);
+        }
+        for (topic, states) in held {
+            for HeldState { at, mut delivery } in states {
+                if !is_unsure(at) {
+                    // The former active bridge has published it: it is for late joiners only.
+                    delivery.kept = Kept::Again;
+                }
+                self.push(topic, Item::Delivery(delivery));
+            }
+        }
+        for (topic, (at, delivery)) in losses {
+            if is_unsure(at) {
+                self.tell(Output::CommanderLost { topic });
+                self.push(topic, Item::Delivery(delivery));
+            } else {
+                self.recycle(delivery.payload);
+            }
+        }
+        self.introduce_again(now);
+    }
+
+    /// Continues the sequence numbers of an own topic, and repeats its state.
+    fn continue_own(&mut self, topic: TopicId, now: Now) {
+        let Some(Topic {
+            role: Role::Ours(writer),
+            queue,
+            gate,
+            lasting,
+            announce_at,
+            ready,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        while queue.pop().is_some() {}
+        writer.continue_after(SKIPPED);
+        if writer.is_live() {
+            writer.begin_round(now.monotonic);
+        }
+        *announce_at = announce_at.map(|_| now.monotonic);
+        let outdated = match lasting {
+            // The former active bridge may have sent it.
+            Lasting::Event => gate.as_mut().and_then(|gate| gate.drop_held()),
+            Lasting::State | Lasting::AsSource => None,
+        };
+        let repeats = writer.repeats();
+        if repeats && !*ready {
+            *ready = true;
+            self.ready.push_back(topic);
+        }
+        if let Some((outdated, _)) = outdated {
+            self.recycle(outdated.bytes);
+            let cause = (Reason::Takeover, "gap");
+            self.count_only(About::topic(topic), cause, 1, String::new);
+        }
+        self.schedule(topic);
+    }
+
+    /// Announces this program, so that its confirmations count.
+    fn introduce_again(&mut self, now: Now) {
+        let Some(discovery) = &mut self.discovery else {
+            return;
+        };
+        let since = discovery.since_start(now);
+        let subject = Subject::ApplicationInformation;
+        // A planned announcement already contains the information.
+        let _planned = discovery
+            .announcer
+            .announce(subject, Included::default(), since)
+            .is_ok();
+        discovery.reckon();
+    }
+}
+
+/// Returns whether an event was first sent before the takeover: the former active bridge may have
+/// delivered it. `within` is the time for which its writer repeats it until it is confirmed.
+pub(super) fn precedes(
+    took_over: Instant,
+    place: &Place,
+    (lasting, within): (Lasting, Option<Duration>),
+    now: Now,
+) -> bool {
+    let (Some(stamp), Some(sent)) = (place.stamp, place.sent) else {
+        return false;
+    };
+    let Ok(age) = u64::try_from(sent.unix_nanos() - stamp.unix_nanos()) else {
+        return false;
+    };
+    let age = Duration::from_nanos(age);
+    let is_event = match lasting {
+        Lasting::State => false,
+        Lasting::Event => true,
+        // An older value is a stored state.
+        Lasting::AsSource => age < within.unwrap_or_default().max(OLDEST_EVENT),
+    };
+    let first = now.monotonic.checked_sub(age);
+    is_event && first.is_none_or(|first| first + SLACK < took_over)
+}
+
+/// The number of sequence numbers that are skipped at a takeover: more than the former active
+/// bridge can have sent after its last message that this bridge received, and less than readers
+/// take for a restart (OPC 10000-14, 7.2.3).
+const SKIPPED: u16 = 1_024;
+/// The age from which a value is a stored state and no event. Events without confirmation are
+/// repeated for a shorter time.
+const OLDEST_EVENT: Duration = Duration::from_millis(500);
+/// The time by which the clocks of the writer and of the network may differ. The former active
+/// bridge has sent nothing for longer at a takeover.
+const SLACK: Duration = Duration::from_millis(5);

@@ -1,0 +1,95 @@
+//! The redundant bridges of other spaces: messages of a bridge that is not active are dropped.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use mappings::SpaceId;
+
+use crate::counters::Reason;
+use crate::redundancy::Heartbeat;
+use crate::router::{About, Router};
+use crate::settings::Now;
+
+/// The redundant bridges of another space.
+#[derive(Debug)]
+pub(in crate::router) struct ActiveSender {
+    heartbeat: Heartbeat,
+    from: SocketAddr,
+    at: Instant,
+    /// The addresses of all bridges of the space, by instance.
+    members: BTreeMap<u32, SocketAddr>,
+}
+
+impl Router {
+    /// Records the redundant bridges of another space.
+    pub(super) fn meet_redundant(
+        &mut self,
+        space: SpaceId,
+        heartbeat: Heartbeat,
+        from: SocketAddr,
+        now: Now,
+    ) {
+        let at = now.monotonic;
+        let senders = self.redundant_senders.entry(space);
+        let sender = senders.or_insert_with(|| ActiveSender {
+            heartbeat,
+            from,
+            at,
+            members: BTreeMap::new(),
+        });
+        if sender.members.len() >= MOST_MEMBERS {
+            sender.members.clear();
+        }
+        sender.members.insert(heartbeat.instance(), from);
+        let same = sender.heartbeat.instance() == heartbeat.instance();
+        let before = sender.heartbeat.precedence();
+        let stale = at.saturating_duration_since(sender.at) >= SENDER_LOST;
+        let replaces = heartbeat.is_active()
+            && (!sender.heartbeat.is_active() || stale || heartbeat.precedence() > before);
+        if same || replaces {
+            (sender.heartbeat, sender.from, sender.at) = (heartbeat, from, at);
+        }
+    }
+
+    /// Returns whether a redundant bridge of another space sends values although another bridge of
+    /// the space is active: its message was under way at the takeover. Counts it.
+    pub(in crate::router) fn is_superseded(
+        &mut self,
+        space: SpaceId,
+        from: SocketAddr,
+        now: Now,
+    ) -> bool {
+        let Some(sender) = self.redundant_senders.get(&space) else {
+            return false;
+        };
+        let is_known = sender.heartbeat.is_active()
+            && now.monotonic.saturating_duration_since(sender.at) < SENDER_LOST;
+        let is_superseded = is_known
+            && sender.from != from
+            && sender.members.values().any(|member| *member == from);
+        if is_superseded {
+            let active = sender.from;
+            let cause = (Reason::Takeover, "superseded");
+            self.count(About::sender(from), cause, 1, || {
+                format!("{active} is the active bridge of space {space}, and {from} sent a value")
+            });
+        }
+        is_superseded
+    }
+
+    /// Returns whether the sender is known to be the active bridge of another space, because its
+    /// heartbeat was secured as its message is.
+    pub(in crate::router) fn is_active_sender(&self, space: SpaceId, from: SocketAddr) -> bool {
+        let sender = self.redundant_senders.get(&space);
+        let is_active =
+            sender.is_some_and(|sender| sender.from == from && sender.heartbeat.is_active());
+        is_active && self.guard.is_some() && !self.in_clear
+    }
+}
+
+/// The time after which the active bridge of another space counts as lost.
+const SENDER_LOST: Duration = Duration::from_secs(1);
+/// The maximum number of known bridges of another space. It is limited, because any sender in an
+/// unsecured group can send heartbeats.
+const MOST_MEMBERS: usize = 8;

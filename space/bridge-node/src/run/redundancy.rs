@@ -1,0 +1,131 @@
+//! The redundancy of a bridge: heartbeats, changes of its role, and the requests of the operator.
+
+use bridge_core::{MuteCause, RoleChange};
+use mappings::Mapping;
+use tracing::{error, info, warn};
+use transport::{Held, Outgoing};
+
+use super::Shell;
+use crate::clock::now;
+use crate::port::Port;
+use crate::redundancy::uncovered;
+
+impl<P: Port> Shell<P> {
+    /// Handles the datagrams that wait in the socket, so that no takeover is decided before the
+    /// heartbeats that have arrived are read.
+    pub(super) fn read_waiting(&mut self, buffer: &mut Vec<u8>) {
+        if self.router.redundancy().is_none() {
+            return;
+        }
+        for _ in 0..READ_AT_ONCE {
+            let Some(received) = self.carrier.try_recv(buffer) else {
+                return;
+            };
+            self.heard(received, buffer);
+            self.drain();
+        }
+    }
+
+    pub(super) fn send_heartbeat(&mut self, bytes: Vec<u8>) {
+        let now = now();
+        let is_sent = self.send(&Outgoing::new(&bytes)).is_ok();
+        self.router.heartbeat_sent(is_sent, now);
+        self.router.recycle(bytes);
+    }
+
+    pub(super) fn tell_role(&mut self, change: RoleChange) {
+        let rank = self.router.redundancy().map(|state| state.rank().get());
+        match change {
+            RoleChange::TookOver { cause, epoch, gap } => {
+                let gap_ms = gap.map(|gap| u64::try_from(gap.as_millis()).unwrap_or(u64::MAX));
+                info!(
+                    rank,
+                    epoch,
+                    gap_ms,
+                    "this bridge is active: {}",
+                    cause.text()
+                );
+            }
+            RoleChange::Follows { rank: other, from } => {
+                info!(rank, active_rank = other.get(), active = %from, "this bridge is a standby");
+            }
+            RoleChange::Muted { cause } => {
+                let is_planned = matches!(cause, MuteCause::Released | MuteCause::Unfit);
+                self.port.drop_waiting(!is_planned);
+                warn!(
+                    rank,
+                    "this bridge was active and sends nothing: {}",
+                    cause.text()
+                );
+            }
+            RoleChange::Rival { rank: other, from } => {
+                warn!(
+                    rank,
+                    other_rank = other.get(),
+                    other = %from,
+                    "another bridge was active at the same time: values may be doubled; check the network between \
+                     the hosts"
+                );
+            }
+            RoleChange::SameRank { from } => {
+                error!(rank, other = %from, "another bridge has the same rank; give one of them another --rank");
+            }
+            RoleChange::CutOff => {
+                warn!(
+                    rank,
+                    "the group is out of reach: a standby takes over the values, and this bridge publishes `on_loss` \
+                     on its ROS side"
+                );
+            }
+        }
+    }
+
+    /// Hands over to a standby on request of the operator.
+    pub(super) fn switch_over(&mut self) {
+        match self.router.switch_over(now()) {
+            Ok(()) => info!("hands over to the standby"),
+            Err(refusal) => warn!("does not hand over: {refusal}"),
+        }
+    }
+
+    /// Hands over to a standby at the end of the program.
+    pub(super) fn hand_over_at_end(&mut self) {
+        if self.router.switch_over(now()).is_ok() {
+            info!("hands over to the standby");
+            while self.drain() {}
+        }
+    }
+
+    /// Sets whether the ROS side is within reach.
+    pub(super) fn look_at_fitness(&mut self) {
+        if self.router.redundancy().is_none() {
+            return;
+        }
+        let is_held = self
+            .held
+            .as_ref()
+            .is_none_or(|held| Held::lost(held).is_none());
+        let is_fit = is_held && self.port.hindrance().is_none();
+        self.router.set_fit(is_fit);
+    }
+
+    /// Returns the reasons for which the redundancy does not work.
+    pub(super) fn redundancy_faults(&self) -> impl Iterator<Item = String> {
+        let now = now().monotonic;
+        let state = self.router.redundancy();
+        let double = state.filter(|state| state.has_double(now));
+        double.into_iter().map(|state| {
+            let rank = state.rank().get();
+            format!("another bridge has rank {rank} too: give one of them another --rank")
+        })
+    }
+
+    /// Returns the parts of a new mapping that a redundant bridge does not carry.
+    pub(super) fn not_redundant(&self, mapping: &Mapping) -> Option<String> {
+        self.router.redundancy()?;
+        uncovered(mapping, self.own)
+    }
+}
+
+/// The maximum number of datagrams that are handled before a heartbeat.
+const READ_AT_ONCE: usize = 256;
