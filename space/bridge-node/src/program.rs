@@ -318,10 +318,7 @@ async fn prepare<P: Program>(
     let mut router = Router::new(settings, Arc::clone(&mapping));
     router.set_owned(P::owned(&mapping), now());
     router.set_relay(relay(carrier.as_ref()));
-    router.set_instance(instance()?);
-    if let Some(rank) = program.rank() {
-        router.set_redundancy(rank, now());
-    }
+    identify(&mut router, program.rank())?;
     keys.start(&mapping, &mut router)?;
     router.call_the_roll(now());
     let context = Context {
@@ -374,6 +371,15 @@ async fn prepare<P: Program>(
         observer,
         _told: told,
     })
+}
+
+/// Sets the instance of a program, and its rank among the redundant bridges of its space.
+fn identify(router: &mut Router, rank: Option<Rank>) -> Result<(), Failure> {
+    router.set_instance(instance()?);
+    if let Some(rank) = rank {
+        router.set_redundancy(rank, now());
+    }
+    Ok(())
 }
 
 /// Completes when the program is to stop, or when the sender is dropped.

@@ -243,15 +243,8 @@ impl Router {
             }
         };
         let is_confirmed = confirming.is_some();
-        if let Some(took_over) = took_over
-            && let Some(Ok(_)) = &admitted
-            && precedes(
-                took_over,
-                &place,
-                (*lasting, confirming.as_deref().map(Confirming::within)),
-                now,
-            )
-        {
+        let lasts = (*lasting, confirming.as_deref().map(Confirming::within));
+        if matches!(admitted, Some(Ok(_))) && precedes(took_over, &place, lasts, now) {
             admitted = Some(Err(Reason::Takeover));
         }
         if let Some(Ok(admitted)) = &admitted {

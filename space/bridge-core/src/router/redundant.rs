@@ -400,18 +400,18 @@ impl Router {
             return;
         };
         entry.ready = false;
+        if let Role::Ours(writer) = &mut entry.role {
+            writer.end_repetitions();
+        }
         let mut dropped = u64::from(entry.sending.take().is_some());
-        while let Some(item) = entry.queue.pop() {
+        while let Some(item) = self.topics.get_mut(&topic).and_then(|of| of.queue.pop()) {
             if let Item::Message(Message::Datagram(encoded)) = item {
                 dropped += u64::from(!encoded.is_keep_alive());
-                self.spare.push(encoded.bytes);
+                // The next message in the buffer must not follow this one.
+                self.recycle(encoded.bytes);
             } else {
                 dropped += 1;
             }
-        }
-        self.spare.truncate(super::SPARE_BUFFERS);
-        if let Role::Ours(writer) = &mut entry.role {
-            writer.end_repetitions();
         }
         let Some(redundant) = self.redundant.as_mut().filter(|_| dropped > 0) else {
             return;
@@ -528,15 +528,19 @@ impl Router {
 
     /// Empties the queue of a topic if it is muted. Returns false if it is not muted.
     pub(super) fn mute_topic(&mut self, topic: TopicId, now: Now) -> bool {
-        if self.is_home(topic) {
-            let is_muted = self.is_muted();
-            if is_muted {
-                self.mute_own(topic);
-            }
-            return is_muted;
+        let is_muted = match self.is_home(topic) {
+            true => self.is_muted(),
+            false => self.is_muted_locally(),
+        };
+        if is_muted {
+            self.empty_topic(topic, now);
         }
-        if !self.is_muted_locally() {
-            return false;
+        is_muted
+    }
+
+    fn empty_topic(&mut self, topic: TopicId, now: Now) {
+        if self.is_home(topic) {
+            return self.mute_own(topic);
         }
         while let Some(item) = self.topics.get_mut(&topic).and_then(|of| of.queue.pop()) {
             if let Item::Delivery(delivery) = item {
@@ -546,11 +550,15 @@ impl Router {
         if let Some(entry) = self.topics.get_mut(&topic) {
             entry.ready = false;
         }
-        true
     }
 
     /// Continues where the former active bridge ended. `gap` is the time since its last heartbeat.
     fn unmute(&mut self, gap: Option<Duration>, now: Now) {
+        // The former active bridge may have sent or published what waits since the last output.
+        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        for topic in &topics {
+            self.empty_topic(*topic, now);
+        }
         let Some(redundant) = &mut self.redundant else {
             return;
         };
@@ -566,7 +574,6 @@ impl Router {
             let cause = (Reason::Takeover, "gap");
             self.count_only(About::topic(topic), cause, count, String::new);
         }
-        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
         for topic in topics {
             self.continue_own(topic, now);
         }
@@ -647,12 +654,12 @@ impl Router {
 /// Returns whether an event was first sent before the takeover: the former active bridge may have
 /// delivered it. `within` is the time for which its writer repeats it until it is confirmed.
 pub(super) fn precedes(
-    took_over: Instant,
+    took_over: Option<Instant>,
     place: &Place,
     (lasting, within): (Lasting, Option<Duration>),
     now: Now,
 ) -> bool {
-    let (Some(stamp), Some(sent)) = (place.stamp, place.sent) else {
+    let (Some(took_over), Some(stamp), Some(sent)) = (took_over, place.stamp, place.sent) else {
         return false;
     };
     let Ok(age) = u64::try_from(sent.unix_nanos() - stamp.unix_nanos()) else {
