@@ -331,8 +331,7 @@ async fn prepare<P: Program>(
         observer.mapped(&taken);
     }
     let port = program.start(context).await?;
-    let application = port.application();
-    let application = application.unwrap_or_else(|| plain(P::NAME, own));
+    let application = port.application().unwrap_or_else(|| plain(P::NAME, own));
     let told = group.and_then(|options| {
         program.tell(&Carried {
             application: &application,

@@ -1,6 +1,9 @@
 //! The redundancy of a bridge: heartbeats, changes of its role, and the requests of the operator.
 
-use bridge_core::{MuteCause, RoleChange};
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use bridge_core::{MuteCause, Rank, RoleChange, TakeoverCause};
 use mappings::Mapping;
 use tracing::{error, info, warn};
 use transport::{Held, Outgoing};
@@ -36,40 +39,15 @@ impl<P: Port> Shell<P> {
     pub(super) fn tell_role(&mut self, change: RoleChange) {
         let rank = self.router.redundancy().map(|state| state.rank().get());
         match change {
-            RoleChange::TookOver { cause, epoch, gap } => {
-                let gap_ms = gap.map(|gap| u64::try_from(gap.as_millis()).unwrap_or(u64::MAX));
-                info!(
-                    rank,
-                    epoch,
-                    gap_ms,
-                    "this bridge is active: {}",
-                    cause.text()
-                );
-            }
-            RoleChange::Follows { rank: other, from } => {
-                info!(rank, active_rank = other.get(), active = %from, "this bridge is a standby");
-            }
+            RoleChange::TookOver { cause, epoch, gap } => tell_active(rank, (cause, epoch, gap)),
+            RoleChange::Follows { rank: other, from } => tell_standby(rank, (other, from)),
             RoleChange::Muted { cause } => {
                 let is_planned = matches!(cause, MuteCause::Released | MuteCause::Unfit);
                 self.port.drop_waiting(!is_planned);
-                warn!(
-                    rank,
-                    "this bridge was active and sends nothing: {}",
-                    cause.text()
-                );
+                tell_muted(rank, cause);
             }
-            RoleChange::Rival { rank: other, from } => {
-                warn!(
-                    rank,
-                    other_rank = other.get(),
-                    other = %from,
-                    "another bridge was active at the same time: values may be doubled; check the network between \
-                     the hosts"
-                );
-            }
-            RoleChange::SameRank { from } => {
-                error!(rank, other = %from, "another bridge has the same rank; give one of them another --rank");
-            }
+            RoleChange::Rival { rank: other, from } => tell_rival(rank, (other, from)),
+            RoleChange::SameRank { from } => tell_same_rank(rank, from),
             RoleChange::CutOff => {
                 warn!(
                     rank,
@@ -125,6 +103,43 @@ impl<P: Port> Shell<P> {
         self.router.redundancy()?;
         uncovered(mapping, self.own)
     }
+}
+
+fn tell_active(rank: Option<u8>, (cause, epoch, gap): (TakeoverCause, u32, Option<Duration>)) {
+    let gap_ms = gap.map(|gap| u64::try_from(gap.as_millis()).unwrap_or(u64::MAX));
+    info!(
+        rank,
+        epoch,
+        gap_ms,
+        "this bridge is active: {}",
+        cause.text()
+    );
+}
+
+fn tell_standby(rank: Option<u8>, (active, from): (Rank, SocketAddr)) {
+    info!(rank, active_rank = active.get(), active = %from, "this bridge is a standby");
+}
+
+fn tell_muted(rank: Option<u8>, cause: MuteCause) {
+    warn!(
+        rank,
+        "this bridge was active and sends nothing: {}",
+        cause.text()
+    );
+}
+
+fn tell_rival(rank: Option<u8>, (other, from): (Rank, SocketAddr)) {
+    warn!(
+        rank,
+        other_rank = other.get(),
+        other = %from,
+        "another bridge was active at the same time: values may be doubled; check the network between \
+         the hosts"
+    );
+}
+
+fn tell_same_rank(rank: Option<u8>, from: SocketAddr) {
+    error!(rank, other = %from, "another bridge has the same rank; give one of them another --rank");
 }
 
 /// The maximum number of datagrams that are handled before a heartbeat.
