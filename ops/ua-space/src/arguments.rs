@@ -5,6 +5,7 @@ mod discover;
 mod live;
 mod module;
 mod recording;
+mod tap;
 mod write;
 
 pub(crate) use cell::{Doctor, DriverTemplate, New, StatusArguments, Template};
@@ -14,6 +15,7 @@ pub(crate) use live::{
     SourceAt, SourceVerb, Target, Top, Trace, Types, WatchSkills,
 };
 pub(crate) use recording::{Record, Replay, Viewers};
+pub(crate) use tap::Tap;
 pub(crate) use write::Write;
 
 pub(crate) use module::{MtpArguments, MtpRdf, MtpSkills, MtpVerb, PeaArguments};
@@ -197,6 +199,15 @@ pub(crate) enum Verb {
     /// usage, or a parameter is missing or wrong, 69 the call has no executor, or its outcome is
     /// unknown, 74 the output cannot be written, 130 interrupted.
     Call(Call),
+    /// Show each sample of a topic at the programs, and why it crosses or not
+    ///
+    /// Asks the programs of this host with --metrics, or those of --metrics, for the steps of each
+    /// sample: taken from ROS or OPC UA, sent, received, published, or dropped with the reason. A
+    /// program records the steps of a topic while it is tapped.
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 no program with --metrics, or none knows the name, 74 the
+    /// output cannot be written.
+    Tap(Tap),
     /// Write a value of the OPC UA side (origin 0), as an OPC UA client does
     ///
     /// Beside a ua-server that has the value, it is written at this server, with the permissions of

@@ -93,6 +93,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Skills(arguments) => live::skills(arguments),
         Verb::Call(arguments) => live::call(arguments),
         Verb::Trace(arguments) => live::trace(arguments),
+        Verb::Tap(arguments) => cell::tap(arguments),
         Verb::Record(arguments) => live::record(arguments),
         Verb::Replay(arguments) => live::replay(arguments),
         Verb::Live(arguments) => live::serve(arguments),

@@ -34,6 +34,7 @@ pub(crate) use call::call;
 pub(crate) use carrier::broker_mapping;
 pub(crate) use echo::{echo, hz};
 pub(crate) use list::{info, json};
+pub(crate) use names::fitting;
 pub(crate) use record::record;
 pub(crate) use replay::replay;
 pub(crate) use seen::{Timing, TopicSeen, listened};

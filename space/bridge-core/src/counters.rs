@@ -191,6 +191,55 @@ impl Reason {
         }
     }
 
+    /// Returns the meaning of the reason for users.
+    #[must_use]
+    pub const fn meaning(self) -> &'static str {
+        match self {
+            Self::Looped => "the sample returned to the space that produced it",
+            Self::SpaceTaken => "another program sends in the name of this space",
+            Self::NotInSpace => "the ids of the message do not make a topic",
+            Self::PublisherWidth => "the PublisherId is not a UInt16",
+            Self::Malformed => "the bytes violate their encoding",
+            Self::Unsupported => "the message is of an unsupported kind",
+            Self::Invalid => "the writer marked the message as invalid",
+            Self::Untyped => "the local message type of the topic is not known",
+            Self::Mismatch => "the value does not fit the message type of the topic",
+            Self::Duplicate => "the sequence number was already received",
+            Self::Stale => "the sample is older than the last delivered sample",
+            Self::Repeat => "a repetition for late joiners, which was already delivered",
+            Self::Overflow => "the queue of the topic was full, and the oldest sample gave way",
+            Self::TooBig => "the message is larger than the maximum size",
+            Self::Incomplete => "parts of a large message are missing",
+            Self::NoRoom => "the memory for incomplete messages was needed by others",
+            Self::TooManyTopics => "the maximum number of topics is reached",
+            Self::TooManyPublishers => "the maximum number of latched publishers is reached",
+            Self::NoKeyFrame => "a delta frame came before its key frame",
+            Self::Undescribed => "the metadata of the writer has not been received",
+            Self::MetaData => "a metadata announcement was not accepted or not sent",
+            Self::NotPublished => "the local side did not accept the sample",
+            Self::NoSubscriber => "an event without a subscriber on the local side",
+            Self::NotSent => "the socket did not accept the datagram",
+            Self::CallFailed => "the service did not accept the value, or did not respond",
+            Self::IncompatibleQos => "the QoS policies of a peer are incompatible",
+            Self::Unchanged => "the value is unchanged, and the mapping publishes changes only",
+            Self::Outpaced => "a newer value replaced it within the rate limit",
+            Self::CallRefused => "the request is not executed",
+            Self::NotAsked => "the message is for another program",
+            Self::Forged => "the sender is not the one that announced itself",
+            Self::Unconfirmed => {
+                "a bridge has not confirmed the command in time: its outcome is unknown"
+            }
+            Self::Late => "the broker delivered the message after its time",
+            Self::Unsecured => "the message is not secured, but the group is",
+            Self::Downgraded => "the message is secured less than the group demands",
+            Self::Signature => "the signature is not of the group, or the message was changed",
+            Self::Replayed => "the secured message was already received",
+            Self::UnknownKey => "the message is secured with an unknown or expired key",
+            Self::NoKeys => "there is no key to secure the message",
+            Self::Takeover => "the other bridge may have sent or delivered it at a takeover",
+        }
+    }
+
     /// Returns whether the drop leaves a topic of another space with an older value than its writer
     /// has sent.
     pub(crate) const fn is_loss(self) -> bool {

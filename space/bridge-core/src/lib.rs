@@ -64,7 +64,7 @@ pub use redundancy::{
     SwitchRefusal, Takeover, TakeoverCause,
 };
 pub use room::Room;
-pub use router::{MutedSamples, Router};
+pub use router::{Crossing, MutedSamples, Router, Tapped};
 pub use settings::{Local, Now, Relay, Settings};
 pub use uadp::action::{ExecutionId, Refusal};
 pub use uadp::discovery::MessageSecurityMode;

@@ -19,6 +19,7 @@ mod redundant;
 mod reload;
 mod roll;
 mod send;
+mod tap;
 mod told;
 
 use std::cmp::Reverse;
@@ -54,6 +55,8 @@ use discovery::Discovery;
 use own::Claims;
 pub use redundant::MutedSamples;
 use redundant::{ActiveSender, Redundant};
+use tap::Tap;
+pub use tap::{Crossing, Tapped};
 use told::About;
 
 /// Decides which messages cross between a space and UADP. The crate documentation describes its
@@ -110,6 +113,8 @@ pub struct Router {
     base_bytes: usize,
     /// Topics with a large sample that may wait for its local type.
     large_held: Vec<TopicId>,
+    /// The tapped topics; `None` without tapped topics.
+    tap: Option<Box<Tap>>,
     /// Buffers returned by [`recycle`](Self::recycle).
     spare: Vec<Vec<u8>>,
     /// Counters of datagrams and messages without a topic, and of removed topics.
@@ -152,6 +157,7 @@ impl Router {
             timers: BinaryHeap::new(),
             base_bytes: 0,
             large_held: Vec::new(),
+            tap: None,
             spare: Vec::new(),
             others: Counters::default(),
             hops: Hops::new(),
@@ -252,6 +258,9 @@ impl Router {
             received,
             latched_by,
         } = heard;
+        self.note(topic, || Crossing::Taken {
+            bytes: payload.len(),
+        });
         if !self.may_cross(Side::Local, What::Value, topic) {
             return self.refuse(topic, Reason::Looped, String::new());
         }
@@ -507,6 +516,9 @@ impl Router {
     /// Records that the local side published a delivery of the topic at `now`. The value is good.
     pub fn published(&mut self, topic: TopicId, arrived: Timestamp, now: Now) {
         self.hops.record(Hop::In, arrived, now.utc);
+        self.note(topic, || Crossing::Published {
+            after: now.utc.unix_nanos() - arrived.unix_nanos(),
+        });
         self.is_good(topic, now);
     }
 

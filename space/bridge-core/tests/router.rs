@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_core::{
-    Delivery, Heard, Hop, Local, Notice, Now, Output, PublisherKey, Reason, Router, Settings,
-    Verdict,
+    Crossing, Delivery, Heard, Hop, Local, Notice, Now, Output, PublisherKey, Reason, Router,
+    Settings, Verdict,
 };
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
@@ -831,4 +831,71 @@ fn only_value(datagram: &[u8]) -> u32 {
         Some(Ok(Variant::Scalar(Scalar::UInt32(value)))) => value,
         other => panic!("{other:?}"),
     }
+}
+
+#[test]
+fn a_tapped_topic_shows_each_step_of_its_samples_and_others_none() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    let (theirs, ours, other) = (topic("ua_2_5_10"), topic("ua_1_5_10"), topic("ua_1_5_11"));
+    for topic in [theirs, ours, other] {
+        bench.bind(topic, "std_msgs/UInt32");
+    }
+    let steps = |bench: &mut Bench| -> Vec<Crossing> {
+        let events = std::iter::from_fn(|| bench.router.next_tapped());
+        events.map(|event| event.crossing).collect()
+    };
+    let cross = |bench: &mut Bench| {
+        bench.hear(&Frame::new(10, 1, 7).bytes());
+        let outputs = bench.outputs();
+        bench.take(&outputs);
+        for topic in [ours, other] {
+            assert_eq!(bench.say(topic, &[7, 0, 0, 0]), Verdict::Forward);
+        }
+        bench.outputs();
+    };
+    cross(&mut bench);
+    assert!(!bench.router.is_tapped());
+    assert_eq!(steps(&mut bench), []);
+    bench.router.tap(&[ours, theirs]);
+    // The second sample of the same number.
+    cross(&mut bench);
+    let seen = steps(&mut bench);
+    let [
+        Crossing::Received {
+            sequence: Some(1),
+            keep_alive: false,
+            ..
+        },
+        Crossing::Dropped {
+            reason: Reason::Duplicate | Reason::Repeat,
+            from: Some(_),
+            count: 1,
+            ..
+        },
+        Crossing::Taken { bytes: 4 },
+        Crossing::Sent { .. },
+    ] = &seen[..]
+    else {
+        panic!("{seen:?}");
+    };
+    bench.hear(&Frame::new(10, 2, 8).bytes());
+    let outputs = bench.outputs();
+    bench.take(&outputs);
+    let seen = steps(&mut bench);
+    assert!(
+        matches!(
+            seen[..],
+            [Crossing::Received { .. }, Crossing::Published { after: 0 }]
+        ),
+        "{seen:?}"
+    );
+    // Events that are not taken are bounded.
+    for sequence in 3..1_100 {
+        bench.hear(&Frame::new(10, sequence, 8).keep_alive());
+    }
+    assert!(bench.router.take_lost_taps() > 0);
+    assert!(steps(&mut bench).len() <= 1_024);
+    bench.router.tap(&[]);
+    cross(&mut bench);
+    assert_eq!(steps(&mut bench), []);
 }

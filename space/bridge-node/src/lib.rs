@@ -34,6 +34,7 @@ mod services;
 mod signals;
 mod stamp;
 mod status;
+mod tap;
 
 pub use actions::{ActionGraph, Actions};
 pub use arguments::{Arguments, Flags, WithoutMapping};

@@ -22,6 +22,7 @@ use tracing::{debug, info};
 
 use crate::clock;
 use crate::exit::{Failure, FailureKind};
+use crate::tap::{TapRequest, Taps};
 
 /// The state of a program at one moment, as the pages show it.
 pub trait Told: Send + 'static {
@@ -103,16 +104,17 @@ pub(crate) fn never<T>() -> Requests<T> {
 /// # Errors
 /// The address cannot be bound.
 pub async fn serve_pages<T: Told>(address: Option<SocketAddr>) -> Result<Requests<T>, Failure> {
-    let requests = serve(address, 1, None).await?.pop();
+    let requests = serve(address, 1, (None, None)).await?.pop();
     Ok(requests.unwrap_or_else(never))
 }
 
 /// Listens at `address` and returns the receivers of requests for `loops` run loops. Without an
-/// address there are no requests. Further paths are answered by `site`.
+/// address there are no requests. Further paths are answered by `site`; `taps` are the tapped
+/// topics of the run loops.
 pub(crate) async fn serve<T: Told>(
     address: Option<SocketAddr>,
     loops: usize,
-    site: Option<Arc<dyn Site>>,
+    (site, taps): (Option<Arc<dyn Site>>, Option<Arc<Taps>>),
 ) -> Result<Vec<Requests<T>>, Failure> {
     let (ask, mut requests): (Vec<_>, Vec<_>) = (0..loops).map(|_| mpsc::channel(4)).unzip();
     // The caller pops from the end; responses have to be in the order of the spaces.
@@ -139,7 +141,7 @@ pub(crate) async fn serve<T: Told>(
             Box::pin(async move { statuses(&ask).await.iter().map(T::json).collect() })
         }));
     }
-    drop(tokio::spawn(accept(listener, Served { ask, site })));
+    drop(tokio::spawn(accept(listener, Served { ask, site, taps })));
     Ok(requests)
 }
 
@@ -147,6 +149,7 @@ pub(crate) async fn serve<T: Told>(
 struct Served<T> {
     ask: Ask<T>,
     site: Option<Arc<dyn Site>>,
+    taps: Option<Arc<Taps>>,
 }
 
 impl<T> Clone for Served<T> {
@@ -154,6 +157,7 @@ impl<T> Clone for Served<T> {
         Self {
             ask: Arc::clone(&self.ask),
             site: self.site.clone(),
+            taps: self.taps.clone(),
         }
     }
 }
@@ -286,10 +290,19 @@ async fn statuses<T>(ask: &Ask<T>) -> Vec<T> {
 
 async fn page<T: Told>(
     request: Request<Incoming>,
-    Served { ask, site }: Served<T>,
+    Served { ask, site, taps }: Served<T>,
     visit: Visit,
 ) -> Response<PageBody> {
     let page = match request.uri().path() {
+        "/tap" => {
+            return match taps {
+                Some(taps) => tapped(&request, visit.peer, (&ask, &taps)).await,
+                None => text(
+                    StatusCode::NOT_FOUND,
+                    "this program passes on no values\n".into(),
+                ),
+            };
+        }
         "/metrics" => Page::Metrics,
         "/status" => Page::Status,
         "/readyz" => Page::Ready,
@@ -336,6 +349,36 @@ async fn page<T: Told>(
     }
 }
 
+/// Returns the events of a tapped topic. Only programs on this host may ask, because the details of
+/// a drop may have values.
+async fn tapped<T: Told>(
+    request: &Request<Incoming>,
+    peer: SocketAddr,
+    (ask, taps): (&Ask<T>, &Taps),
+) -> Response<PageBody> {
+    if !peer.ip().to_canonical().is_loopback() {
+        let why = "topics are tapped from this host only\n".to_owned();
+        return text(StatusCode::FORBIDDEN, why);
+    }
+    let wanted = match TapRequest::parse(request.uri().query().unwrap_or_default()) {
+        Ok(wanted) => wanted,
+        Err(why) => return text(StatusCode::BAD_REQUEST, format!("{why}\n")),
+    };
+    match taps.answer(&wanted, clock::now().monotonic) {
+        Some(answer) => {
+            if answer.is_new {
+                // Each run loop wakes up, and records events before the response is sent.
+                let _statuses = statuses(ask).await;
+            }
+            text(StatusCode::OK, answer.json)
+        }
+        None => text(
+            StatusCode::TOO_MANY_REQUESTS,
+            "too many topics are tapped\n".into(),
+        ),
+    }
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Page {
     Metrics,
@@ -377,6 +420,7 @@ mod tests {
         let served = Served {
             ask: [ask].into(),
             site: None,
+            taps: None,
         };
         tokio::spawn(accept(listener, served));
         (address, requests)

@@ -39,6 +39,7 @@ use crate::service;
 use crate::service_manager;
 use crate::signals;
 use crate::status::Status;
+use crate::tap::Taps;
 
 /// The parts of a program, for [`run`].
 pub trait Program: Parser {
@@ -245,8 +246,9 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         )?;
         let (changed, changes) = watch::channel(running);
         service_manager::start_watchdog();
-        let mut requests =
-            metrics::serve(arguments.flags.metrics, spaces.len(), program.site()?).await?;
+        let taps = Arc::<Taps>::default();
+        let pages = (program.site()?, Some(Arc::clone(&taps)));
+        let mut requests = metrics::serve(arguments.flags.metrics, spaces.len(), pages).await?;
         let several = spaces.len() > 1;
         let (stopping, stop) = watch::channel(false);
         let mut shells = JoinSet::new();
@@ -258,7 +260,8 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
                 Span::none()
             };
             let requests = requests.pop().unwrap_or_else(metrics::never);
-            let shell = prepare(&program, (&changes, &switches), (own, several), requests);
+            let pages = (requests, &taps);
+            let shell = prepare(&program, (&changes, &switches), (own, several), pages);
             let shell = shell.instrument(span.clone());
             let ended = shell.await?.run(told(stop.clone()));
             // Run as separate tasks: waking the future given to `block_on` costs a system call each
@@ -290,7 +293,7 @@ async fn prepare<P: Program>(
     program: &P,
     (changes, switches): (&watch::Receiver<Running>, &watch::Receiver<u64>),
     (own, several): (SpaceId, bool),
-    requests: Requests<Status>,
+    (requests, taps): (Requests<Status>, &Arc<Taps>),
 ) -> Result<Shell<P::Port>, Failure> {
     let arguments = program.arguments();
     let Running {
@@ -353,6 +356,7 @@ async fn prepare<P: Program>(
         owned: P::owned,
         claims: P::CLAIMS,
         requests,
+        taps: Arc::clone(taps),
         changes: changes.clone(),
         switches: switches.clone(),
         keys,

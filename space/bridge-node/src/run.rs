@@ -3,6 +3,7 @@
 mod awaited;
 mod calls;
 mod redundancy;
+mod taps;
 
 use std::collections::BTreeMap;
 use std::future::poll_fn;
@@ -34,6 +35,7 @@ use crate::observer::Observer;
 use crate::policy::NO_SUBSCRIBER;
 use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, RedundancyStatus, Status};
+use crate::tap::Taps;
 
 /// The run loop of one space, with its Router, port and carrier, and the requests for the status.
 pub(crate) struct Shell<P> {
@@ -53,6 +55,8 @@ pub(crate) struct Shell<P> {
     /// Whether it listens for other writers in these namespaces before it sends.
     pub(crate) claims: bool,
     pub(crate) requests: Requests<Status>,
+    /// The tapped topics.
+    pub(crate) taps: Arc<Taps>,
     pub(crate) changes: watch::Receiver<Running>,
     /// The requests of the operator to hand over to a standby.
     pub(crate) switches: watch::Receiver<u64>,
@@ -195,6 +199,9 @@ impl<P: Port> Shell<P> {
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
             more |= self.drain();
+            if self.taps.is_on() || self.router.is_tapped() {
+                self.follow_taps();
+            }
         }
     }
 

@@ -81,12 +81,27 @@ pub(crate) struct MappingPage {
 #[serde(default)]
 pub(crate) struct TopicPage {
     pub(crate) name: Option<String>,
+    pub(crate) ros_topics: Vec<RosTopicPage>,
     pub(crate) sent: u64,
     pub(crate) delivered: u64,
     pub(crate) repeated: u64,
     pub(crate) missing: u64,
     pub(crate) sender_changed: u64,
     pub(crate) dropped: BTreeMap<String, u64>,
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Deserialize, Serialize)]
+#[serde(default)]
+pub(crate) struct RosTopicPage {
+    pub(crate) topic: String,
+}
+
+impl TopicPage {
+    /// Returns the name in the mapping and the ROS topics.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        let ros = self.ros_topics.iter().map(|ros| ros.topic.as_str());
+        self.name.as_deref().into_iter().chain(ros)
+    }
 }
 
 #[derive(Debug, Clone, Default, PartialEq, Deserialize, Serialize)]

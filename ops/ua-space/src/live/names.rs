@@ -89,6 +89,18 @@ fn best_fit<'n>(names: impl Iterator<Item = &'n str>, name: &str) -> Option<Fit>
     fits.flatten().min()
 }
 
+/// Returns the topics with the names that fit best.
+pub(crate) fn fitting<'t>(known: &[(&'t str, Vec<&str>)], name: &str) -> Vec<&'t str> {
+    let fits = known.iter().filter_map(|(topic, names)| {
+        let fit = best_fit(names.iter().copied(), name)?;
+        Some((fit, *topic))
+    });
+    let fits: Vec<(Fit, &str)> = fits.collect();
+    let best = fits.iter().map(|(fit, _)| *fit).min();
+    let best = fits.into_iter().filter(|(fit, _)| Some(*fit) == best);
+    best.map(|(_, topic)| topic).collect()
+}
+
 /// Returns the variables of a mapping that fit the target best.
 pub(super) fn mapped<'m>(mapping: &'m Mapping, target: &Target) -> Vec<&'m Variable> {
     let name = match target {

@@ -2,7 +2,7 @@
 
 use mappings::{Overflow, TopicId};
 
-use super::{About, Router};
+use super::{About, Crossing, Router};
 use crate::counters::Reason;
 use crate::guard::Guard;
 use crate::network::join;
@@ -81,13 +81,16 @@ impl Router {
                 .get_mut(&next)
                 .filter(|_| joins)
                 .and_then(|entry| {
+                    let before = entry.counters.repeated;
                     let taken = entry.take_within(left, &mut self.spare)?;
+                    let repeated = entry.counters.repeated != before;
                     entry.counters.sent += 1;
                     entry.ready = entry.has_more();
-                    Some((taken, entry.ready))
+                    Some((taken, entry.ready, repeated))
                 });
             match taken {
-                Some((taken, has_more)) => {
+                Some((taken, has_more, repeated)) => {
+                    self.note(next, || Crossing::Sent { repeated });
                     len += ID + SIZE + taken.data_set_message().len();
                     gathered.push((next, taken));
                     if has_more {

@@ -11,7 +11,7 @@ use uadp::{
 
 use super::content::Quality;
 use super::redundant::precedes;
-use super::{About, Router, late};
+use super::{About, Crossing, Router, late};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::fields;
@@ -200,6 +200,11 @@ impl Router {
             topic: Some(topic),
             from: Some(from),
         };
+        self.note(topic, || Crossing::Received {
+            from,
+            sequence: message.sequence_number(),
+            keep_alive: message.kind == MessageKind::KeepAlive,
+        });
         if !message.is_valid() {
             return self.count(about, Reason::Invalid, 1, || {
                 "the writer marked its DataSetMessage as invalid".to_owned()

@@ -2,7 +2,7 @@
 
 use mappings::TopicId;
 
-use super::{About, Router};
+use super::{About, Crossing, Router};
 use crate::counters::Reason;
 use crate::network::chunk;
 use crate::output::Output;
@@ -106,6 +106,7 @@ impl Router {
             return None;
         }
         let entry = self.topics.get_mut(&topic)?;
+        let repeated = entry.counters.repeated;
         let item = match entry.sending {
             Some(_) => None,
             None => entry.take(&mut self.spare),
@@ -126,9 +127,13 @@ impl Router {
             None if entry.sending.is_some() => return self.send_chunk(topic, now),
             None => (None, None),
         };
+        let repeated = entry.counters.repeated != repeated;
         entry.ready = entry.has_more();
         if entry.ready {
             self.ready.push_back(topic);
+        }
+        if datagram.is_some() {
+            self.note(topic, || Crossing::Sent { repeated });
         }
         match datagram {
             Some(datagram) => self.datagram(topic, datagram, now),
@@ -157,12 +162,16 @@ impl Router {
                 entry.counters.sent += 1;
             }
         }
+        let is_whole = entry.sending.is_none();
         if let Role::Ours(writer) = &mut entry.role {
             writer.spoke(now.monotonic);
         }
         entry.ready = entry.has_more();
         if entry.ready {
             self.ready.push_back(topic);
+        }
+        if is_whole && written.is_ok() {
+            self.note(topic, || Crossing::Sent { repeated: false });
         }
         match written {
             Ok(_) => {

@@ -44,6 +44,15 @@ impl Router {
         };
         let total = counters.add(cause, count);
         let before = total.saturating_sub(count);
+        if let Some(topic) = topic.filter(|topic| self.taps(*topic)) {
+            let detail = detail();
+            self.note_drop((topic, from), cause, (count, &detail));
+            let about = About {
+                topic: Some(topic),
+                from,
+            };
+            return self.tell_of_drop(about, cause, (before, total), || detail);
+        }
         self.tell_of_drop(About { topic, from }, cause, (before, total), detail);
     }
 

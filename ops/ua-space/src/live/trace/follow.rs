@@ -56,7 +56,8 @@ pub(super) fn follow(arguments: &Trace, target: &Target) -> Result<(), Failure> 
         if shown == 0 && ended != Ended::Interrupted {
             let group = live.group();
             return Err(Failure::Unavailable(format!(
-                "no sample of {topic} came in {group}\n  = help: `ua-space info {topic}` shows its publisher"
+                "no sample of {topic} came in {group}\n  = help: `ua-space tap {topic}` shows where it \
+                 is dropped"
             )));
         }
         if !arguments.json {

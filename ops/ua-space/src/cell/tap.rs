@@ -1,0 +1,444 @@
+//! `ua-space tap`: shows each sample of a topic at the programs that pass it on, and the reason why
+//! it does not cross.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{self, Write as _};
+use std::time::Duration;
+
+use mappings::TopicId;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::time::{Instant, MissedTickBehavior, interval};
+
+use super::pages::{self, Page};
+use super::pages_of_this_host;
+use crate::arguments::{Tap, Target};
+use crate::exit::Failure;
+use crate::http::Server;
+use crate::iso_time;
+use crate::live::{fitting, harmless, json};
+use crate::report::warn;
+use crate::survey::look;
+
+/// Runs `ua-space tap`.
+pub(crate) fn tap(arguments: &Tap) -> Result<(), Failure> {
+    look(run(arguments))
+}
+
+async fn run(arguments: &Tap) -> Result<(), Failure> {
+    let pages = pages(arguments).await?;
+    let topic = topic(&arguments.target, &pages)?;
+    let mut programs: Vec<Program> = Vec::new();
+    for page in &pages {
+        match programs.iter_mut().find(|one| one.url == page.url) {
+            Some(known) => known.name = page.program.clone(),
+            None => programs.push(Program {
+                name: page.program.clone(),
+                url: page.url.clone(),
+                server: Server::parse(&page.url)?,
+                from: 0,
+                lost: 0,
+                fault: None,
+            }),
+        }
+    }
+    let on =
+        |kind| signal(kind).map_err(|error| Failure::Io(format!("cannot catch signals: {error}")));
+    let (mut interrupt, mut terminate) =
+        (on(SignalKind::interrupt())?, on(SignalKind::terminate())?);
+    let limit = arguments.seconds.map(Duration::try_from_secs_f64);
+    let end = limit
+        .and_then(Result::ok)
+        .map(|limit| Instant::now() + limit);
+    let mut ticks = interval(PERIOD);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut told = Told::new(arguments, topic);
+    loop {
+        let is_over = tokio::select! {
+            biased;
+            Some(()) = interrupt.recv() => true,
+            Some(()) = terminate.recv() => true,
+            _ = ticks.tick() => false,
+        };
+        if is_over {
+            break;
+        }
+        let mut events = Vec::new();
+        for program in &mut programs {
+            events.extend(program.events(topic).await);
+        }
+        events.sort_by_key(|(_, event)| event.at_us);
+        if programs.iter().all(|program| program.fault.is_some()) {
+            let faults = programs.iter().filter_map(|program| program.fault.clone());
+            let faults: Vec<String> = faults.collect();
+            return Err(Failure::Unavailable(faults.join("\n")));
+        }
+        let is_enough = told.tell(events)?;
+        if is_enough || end.is_some_and(|end| Instant::now() >= end) {
+            break;
+        }
+    }
+    for program in &programs {
+        if program.lost > 0 {
+            warn(&format!(
+                "{}: {} lines were lost, because there were too many",
+                program.name, program.lost
+            ));
+        }
+    }
+    told.sum()
+}
+
+/// Returns the status pages of the programs to ask.
+async fn pages(arguments: &Tap) -> Result<Vec<Page>, Failure> {
+    let mut found = Vec::new();
+    if arguments.metrics.is_empty() {
+        found = pages_of_this_host().await;
+        // The MES passes on no values.
+        found.retain(|page| !page.topics.is_empty() || !page.hops.is_empty());
+    }
+    for url in &arguments.metrics {
+        found.extend(pages::of_url(url).await?);
+    }
+    match found.is_empty() {
+        false => Ok(found),
+        true => Err(Failure::Unavailable(
+            "no program of this host has --metrics\n  = help: start the bridge with `--metrics \
+             127.0.0.1:9101`, or name its address here with --metrics"
+                .to_owned(),
+        )),
+    }
+}
+
+/// Returns the topic of the target, by the names that the programs know.
+fn topic(target: &Target, pages: &[Page]) -> Result<TopicId, Failure> {
+    let name = match target {
+        Target::Topic(topic) => return Ok(*topic),
+        Target::Name(name) => name,
+    };
+    let known: Vec<(&str, Vec<&str>)> = pages
+        .iter()
+        .flat_map(|page| &page.topics)
+        .map(|(topic, one)| (topic.as_str(), one.names().collect()))
+        .collect();
+    let found: BTreeSet<&str> = fitting(&known, name).into_iter().collect();
+    let found: Vec<&str> = found.into_iter().collect();
+    let shown = harmless(name);
+    match found.as_slice() {
+        [only] => only
+            .parse()
+            .map_err(|_| Failure::Data(format!("{only} is not a topic"))),
+        [] => {
+            let names = known.iter().flat_map(|(_, names)| names.iter().copied());
+            let help = match mappings::nearest(name, names) {
+                Some(near) => format!("did you mean `{}`?", harmless(near)),
+                None => {
+                    "`ua-space status` shows the programs, `ua-space list` the names".to_owned()
+                }
+            };
+            Err(Failure::Unavailable(format!(
+                "no program knows a topic named {shown}\n  = help: {help}"
+            )))
+        }
+        several => Err(Failure::Usage(format!(
+            "{shown} is the name of {}: give the topic",
+            several.join(", ")
+        ))),
+    }
+}
+
+/// A program that is asked.
+struct Program {
+    name: String,
+    url: String,
+    server: Server,
+    /// The number of the next event.
+    from: u64,
+    lost: u64,
+    /// The reason why it is not asked any more.
+    fault: Option<String>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Answer {
+    next: u64,
+    lost: u64,
+    events: Vec<Event>,
+}
+
+/// A step of a sample at a program.
+#[derive(Debug, Clone, Deserialize, Serialize)]
+struct Event {
+    space: u8,
+    at_us: i64,
+    step: String,
+    #[serde(flatten)]
+    more: BTreeMap<String, Value>,
+}
+
+impl Program {
+    /// Returns the new events of the topic.
+    async fn events(&mut self, topic: TopicId) -> Vec<(String, Event)> {
+        if self.fault.is_some() {
+            return Vec::new();
+        }
+        let path = format!("/tap?topic={topic}&from={}", self.from);
+        let answer = match self.server.get(&path).await {
+            Ok(answer) if answer.status == 200 => answer,
+            Ok(answer) => {
+                let why = harmless(answer.body.trim());
+                let why = format!(
+                    "{} at {}: HTTP status {}: {why}",
+                    self.name, self.url, answer.status
+                );
+                warn(&why);
+                self.fault = Some(why);
+                return Vec::new();
+            }
+            Err(failure) => {
+                warn(&failure.to_string());
+                self.fault = Some(failure.to_string());
+                return Vec::new();
+            }
+        };
+        let Ok(answer) = serde_json::from_str::<Answer>(&answer.body) else {
+            self.fault = Some(format!(
+                "{} at {}: not the events of a topic",
+                self.name, self.url
+            ));
+            return Vec::new();
+        };
+        (self.from, self.lost) = (answer.next, answer.lost);
+        let events = answer.events.into_iter();
+        events.map(|event| (self.name.clone(), event)).collect()
+    }
+}
+
+/// The printed events.
+struct Told<'a> {
+    arguments: &'a Tap,
+    topic: TopicId,
+    lines: u64,
+    /// The number of samples for each program and step.
+    sums: BTreeMap<(String, String), u64>,
+}
+
+#[derive(Serialize)]
+struct Shown<'a> {
+    topic: String,
+    program: &'a str,
+    #[serde(flatten)]
+    event: &'a Event,
+}
+
+impl<'a> Told<'a> {
+    fn new(arguments: &'a Tap, topic: TopicId) -> Self {
+        Self {
+            arguments,
+            topic,
+            lines: 0,
+            sums: BTreeMap::new(),
+        }
+    }
+
+    /// Prints events. Returns true if enough lines are printed.
+    fn tell(&mut self, events: Vec<(String, Event)>) -> Result<bool, Failure> {
+        let mut out = io::stdout().lock();
+        for (program, event) in events {
+            if self.arguments.drops && event.step != DROPPED {
+                continue;
+            }
+            let program = harmless(&program);
+            match self.arguments.json {
+                true => {
+                    let shown = Shown {
+                        topic: self.topic.to_string(),
+                        program: &program,
+                        event: &event,
+                    };
+                    writeln!(out, "{}", json(&shown)?)?;
+                }
+                false => {
+                    let time = iso_time::of_unix_nanos(i128::from(event.at_us) * 1_000);
+                    let time = time.get(11..26).unwrap_or_default();
+                    let space = event.space;
+                    writeln!(out, "{time}  {program} (space {space})  {}", event.text())?;
+                }
+            }
+            let count = event.number("count").unwrap_or(1);
+            let sum = self.sums.entry((program, event.kind())).or_default();
+            *sum = sum.saturating_add(count);
+            self.lines += 1;
+            if self.arguments.count.is_some_and(|most| self.lines >= most) {
+                out.flush()?;
+                return Ok(true);
+            }
+        }
+        out.flush()?;
+        Ok(false)
+    }
+
+    /// Prints the sums.
+    fn sum(&self) -> Result<(), Failure> {
+        if self.arguments.json {
+            return Ok(());
+        }
+        let mut out = io::stdout().lock();
+        if self.sums.is_empty() {
+            writeln!(out, "{}: nothing came by", self.topic)?;
+        }
+        let mut last = "";
+        for ((program, kind), count) in &self.sums {
+            if last != program {
+                writeln!(out, "{program}:")?;
+                last = program;
+            }
+            writeln!(out, "  {count} {kind}")?;
+        }
+        out.flush()?;
+        Ok(())
+    }
+}
+
+impl Event {
+    fn text_of(&self, name: &str) -> &str {
+        self.more
+            .get(name)
+            .and_then(Value::as_str)
+            .unwrap_or_default()
+    }
+
+    fn number(&self, name: &str) -> Option<u64> {
+        self.more.get(name)?.as_u64()
+    }
+
+    fn is(&self, name: &str) -> bool {
+        self.more.get(name) == Some(&Value::Bool(true))
+    }
+
+    /// Returns the step, with the reason of a drop.
+    fn kind(&self) -> String {
+        match self.step.as_str() {
+            DROPPED => format!("dropped: {}", harmless(self.text_of("reason"))),
+            "sent" if self.is("repeated") => "repeated".to_owned(),
+            "received" if self.is("keep_alive") => "keep-alive received".to_owned(),
+            step => harmless(step),
+        }
+    }
+
+    /// Returns the event for people.
+    fn text(&self) -> String {
+        let kind = self.kind();
+        match self.step.as_str() {
+            "taken" => format!(
+                "taken from the local side, {} bytes",
+                self.number("bytes").unwrap_or_default()
+            ),
+            "received" => {
+                let from = harmless(self.text_of("from"));
+                match self.number("sequence") {
+                    Some(sequence) => format!("{kind}, number {sequence} from {from}"),
+                    None => format!("{kind} from {from}"),
+                }
+            }
+            "published" => {
+                let after = self.more.get("after_us").and_then(Value::as_f64);
+                format!(
+                    "published {:.0} us after its arrival",
+                    after.unwrap_or_default()
+                )
+            }
+            DROPPED => {
+                let parts = [
+                    self.text_of("meaning"),
+                    self.text_of("case"),
+                    self.text_of("detail"),
+                ];
+                let mut text = kind;
+                for (at, part) in parts.into_iter().enumerate() {
+                    // The detail often repeats the case.
+                    let is_new = !part.is_empty() && !parts.iter().take(at).any(|one| *one == part);
+                    if is_new {
+                        text.push_str(if at == 0 { ", " } else { "; " });
+                        text.push_str(&harmless(part));
+                    }
+                }
+                match self.number("count") {
+                    Some(count) if count != 1 => format!("{text} ({count} samples)"),
+                    Some(_) | None => text,
+                }
+            }
+            _ => kind,
+        }
+    }
+}
+
+/// The step of a drop.
+const DROPPED: &str = "dropped";
+/// The period of requests; a program records for longer without them.
+const PERIOD: Duration = Duration::from_millis(200);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn event(text: &str) -> Event {
+        serde_json::from_str(text).unwrap()
+    }
+
+    #[test]
+    fn each_step_is_a_line_and_a_drop_has_its_reason() {
+        for (given, wanted) in [
+            (
+                r#"{"space":1,"at_us":0,"step":"taken","bytes":48}"#,
+                "taken from the local side, 48 bytes",
+            ),
+            (
+                r#"{"space":1,"at_us":0,"step":"sent","repeated":true}"#,
+                "repeated",
+            ),
+            (
+                r#"{"space":1,"at_us":0,"step":"received","from":"10.0.0.5:4840","sequence":17,"keep_alive":false}"#,
+                "received, number 17 from 10.0.0.5:4840",
+            ),
+            (
+                r#"{"space":1,"at_us":0,"step":"published","after_us":85.4}"#,
+                "published 85 us after its arrival",
+            ),
+            (
+                r#"{"space":1,"at_us":0,"step":"dropped","reason":"no_subscriber","meaning":"an event without a subscriber","case":"nobody","detail":"nobody","count":2}"#,
+                "dropped: no_subscriber, an event without a subscriber; nobody (2 samples)",
+            ),
+        ] {
+            assert_eq!(event(given).text(), wanted);
+        }
+    }
+
+    #[test]
+    fn a_topic_is_found_by_the_names_of_the_programs() {
+        let status = r#"{"program":"bridge-ros1","topics":{
+            "ua_1_2_10":{"name":"Left.Speed","ros_topics":[{"space":1,"topic":"/left/speed"}]},
+            "ua_1_2_11":{"name":"Right.Speed"}}}"#;
+        let pages = pages::parse(status).unwrap();
+        let of = |name: &str| {
+            let found = topic(&name.parse().unwrap(), &pages);
+            found
+                .map(|topic| topic.to_string())
+                .map_err(|error| error.to_string())
+        };
+        for name in ["Left.Speed", "/left/speed", "left/speed", "ua_1_2_10"] {
+            assert_eq!(of(name).unwrap(), "ua_1_2_10", "{name}");
+        }
+        let wrong = of("Speed").unwrap_err();
+        assert_eq!(
+            wrong,
+            "Speed is the name of ua_1_2_10, ua_1_2_11: give the topic"
+        );
+        assert!(
+            of("Left.Sped")
+                .unwrap_err()
+                .contains("did you mean `Left.Speed`?")
+        );
+    }
+}
