@@ -12,6 +12,7 @@ mod discovery;
 mod follow;
 mod guarded;
 mod held;
+mod inquiries;
 mod late;
 mod own;
 mod receive;
@@ -21,9 +22,10 @@ mod roll;
 mod send;
 mod tap;
 mod told;
+mod values;
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BinaryHeap, HashMap, VecDeque};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -31,20 +33,17 @@ use mappings::{Lasting, Mapping, SpaceId, TopicId};
 use messages::{Dialect, MessageType, PlanError, Selection, Wire};
 use uadp::Timestamp;
 
-use crate::confirm::{Confirmer, Handover};
+use crate::confirm::Handover;
 use crate::counters::{Cause, Counters, Reason, Verdict};
 use crate::fields;
 use crate::gate::{Passage, Waiting};
 use crate::guard::Guard;
 use crate::hops::{Hop, Hops};
-use crate::loop_rule::{Owned, Side, What};
+use crate::loop_rule::{Side, What};
 use crate::loss::{Loss, Reaction, Stop, trigger};
 use crate::network::{check_size, data_set_header, encode, keep_alive};
 use crate::output::{Delivery, Heard, Kept, Output, PublisherKey};
-use crate::pace::Pace;
-use crate::plans::Plans;
-use crate::room::Room;
-use crate::settings::{Local, Now, Relay, Settings};
+use crate::settings::{Local, Now, Settings};
 use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message};
@@ -52,30 +51,17 @@ pub(crate) use by_name::ByName;
 use calls::Calls;
 use chunks::Chunks;
 use discovery::Discovery;
-use own::Claims;
 pub use redundant::MutedSamples;
-use redundant::{ActiveSender, Redundant};
-use tap::Tap;
+use redundant::ActiveSender;
 pub use tap::{Crossing, Tapped};
 use told::About;
+use values::Values;
 
 /// Decides which messages cross between a space and UADP. The crate documentation describes its
 /// use.
 #[derive(Debug)]
 pub struct Router {
-    settings: Settings,
-    owned: Owned,
-    mapping: Arc<Mapping>,
-    topics: HashMap<TopicId, Topic>,
-    /// The limit for topics that are unknown to the mapping and the local side.
-    room: Room,
-    plans: Plans,
-    /// Topics with items to poll, served in turn, so that a topic with large messages does not
-    /// block a topic with small messages.
-    ready: VecDeque<TopicId>,
-    /// Topics with a partly sent large message, which wait for `pace`.
-    paced: VecDeque<TopicId>,
-    pace: Pace,
+    values: Values,
     /// The received chunks of large messages; `None` before the first chunk.
     chunks: Option<Box<Chunks>>,
     /// Own and received metadata; `None` before the first use.
@@ -84,42 +70,14 @@ pub struct Router {
     calls: Option<Box<Calls>>,
     /// Random bytes that distinguish own requests from requests of other programs.
     instance: [u8; 16],
-    /// The own namespaces in which nothing is sent; `None` without such namespaces.
-    claims: Option<Box<Claims>>,
     /// The secured groups; `None` without secured groups.
     guard: Option<Box<Guard>>,
-    /// The redundancy of the own space; `None` without redundancy.
-    redundant: Option<Box<Redundant>>,
     /// The redundant bridges of other spaces.
     redundant_senders: BTreeMap<SpaceId, ActiveSender>,
-    /// The broker between the programs; `None` for a network that does not store messages.
-    relay: Option<Relay>,
     /// Whether the message in processing was received unsecured.
     in_clear: bool,
-    /// The sender of the confirmations of each other space.
-    confirmers: BTreeMap<SpaceId, Confirmer>,
-    /// Own topics with an outcome of the newest event that is not reported yet.
-    settled: VecDeque<TopicId>,
-    /// Outputs other than samples and calls.
-    told: VecDeque<Output>,
-    /// Topics of other spaces with notifications for the port, without duplicates.
-    news: VecDeque<TopicId>,
-    /// Whether `news` is polled before `ready` next time.
-    news_first: bool,
     /// Whether a value was polled before a call last time.
     value_first: bool,
-    timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
-    /// The size in bytes of the key frames stored for delta frames.
-    base_bytes: usize,
-    /// Topics with a large sample that may wait for its local type.
-    large_held: Vec<TopicId>,
-    /// The tapped topics; `None` without tapped topics.
-    tap: Option<Box<Tap>>,
-    /// Buffers returned by [`recycle`](Self::recycle).
-    spare: Vec<Vec<u8>>,
-    /// Counters of datagrams and messages without a topic, and of removed topics.
-    others: Counters,
-    hops: Hops,
 }
 
 impl Router {
@@ -128,39 +86,17 @@ impl Router {
     #[must_use]
     pub fn new(settings: Settings, mapping: Arc<Mapping>) -> Self {
         let guard = Guard::new(mapping.security()).map(Box::new);
+        let overhead = guard.as_ref().map_or(0, |_| Guard::OVERHEAD);
         Self {
-            settings,
-            owned: Owned::All,
-            mapping,
-            topics: HashMap::new(),
-            room: Room::new(follow::MAX_STRAYS),
-            plans: Plans::default(),
-            ready: VecDeque::new(),
-            paced: VecDeque::new(),
-            pace: Pace::default(),
+            values: Values::new(settings, mapping, overhead),
             chunks: None,
             discovery: None,
             calls: None,
             instance: [0; 16],
-            claims: None,
             guard,
-            redundant: None,
             redundant_senders: BTreeMap::new(),
-            relay: None,
             in_clear: true,
-            confirmers: BTreeMap::new(),
-            settled: VecDeque::new(),
-            told: VecDeque::new(),
-            news: VecDeque::new(),
-            news_first: false,
             value_first: false,
-            timers: BinaryHeap::new(),
-            base_bytes: 0,
-            large_held: Vec::new(),
-            tap: None,
-            spare: Vec::new(),
-            others: Counters::default(),
-            hops: Hops::new(),
         }
     }
 
@@ -176,11 +112,255 @@ impl Router {
         selection: &Selection,
         now: Now,
     ) -> Result<(), PlanError> {
+        let is_own = self
+            .values
+            .bind_type(topic, (message_type, selection), now)?;
+        if is_own {
+            self.describe(topic, Some((message_type, selection)), now);
+        }
+        self.inquire(now);
+        Ok(())
+    }
+
+    /// Handles a sample received on the local side.
+    pub fn handle_local(&mut self, heard: Heard<'_>, now: Now) -> Verdict {
+        self.handle_local_as(heard, GOOD, now)
+    }
+
+    /// Handles a sample as [`handle_local`](Self::handle_local) does, with the quality of the
+    /// sample: the upper 16 bits of a StatusCode, which are sent as the Status of the
+    /// DataSetMessage (OPC 10000-14, 7.2.4.5.4).
+    pub fn handle_local_as(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
+        let topic = heard.topic;
+        let verdict = self.values.take_local(heard, status, now);
+        self.inquire(now);
+        self.values.settle_verdict(topic, verdict);
+        verdict
+    }
+
+    /// Removes a latched publisher of a topic of the own space. Its last message is not repeated
+    /// any more.
+    pub fn left(&mut self, topic: TopicId, publisher: PublisherKey, now: Now) {
+        let held = self
+            .values
+            .topics
+            .get_mut(&topic)
+            .and_then(|entry| entry.gate.as_mut())
+            .and_then(|gate| gate.left(publisher, now.monotonic));
+        self.values.let_go(topic, held, now);
+        if let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.values.topics.get_mut(&topic)
+        {
+            writer.forget(publisher);
+            self.values.schedule(topic);
+        }
+        self.inquire(now);
+    }
+
+    /// Sets whether a topic of the own space has a producer. Without a producer its value is not
+    /// repeated, so that readers detect the silence. The next sample sets a producer again.
+    pub fn set_live(&mut self, topic: TopicId, live: bool, now: Now) {
+        if !live {
+            // The waiting sample is the last sample.
+            let held = self
+                .values
+                .topics
+                .get_mut(&topic)
+                .and_then(|entry| entry.gate.as_mut())
+                .and_then(|gate| gate.hurry(now.monotonic));
+            self.values.let_go(topic, held, now);
+        }
+        if let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.values.follow(topic, None, now)
+        {
+            let revived = live && !writer.is_live();
+            writer.set_live(live);
+            if revived && let Some(entry) = self.values.topics.get_mut(&topic) {
+                entry.announce_at = entry.announce_at.map(|_| now.monotonic);
+            }
+            if live && self.values.settings.local == Local::Fields {
+                // No local type will describe the topic.
+                self.describe(topic, None, now);
+            }
+            self.values.settle_arrival(topic);
+            self.values.schedule(topic);
+        }
+        self.inquire(now);
+    }
+
+    /// Repeats values, sends keep-alives, and detects silent topics that are due by `now`.
+    pub fn handle_timeout(&mut self, now: Now) {
+        self.look_at_redundancy(now);
+        while let Some(Reverse((at, topic))) = self.values.timers.peek().copied() {
+            if at > now.monotonic {
+                break;
+            }
+            self.values.timers.pop();
+            let Some(entry) = self.values.topics.get_mut(&topic) else {
+                continue;
+            };
+            if entry.timer != Some(at) {
+                // A later entry has replaced this entry.
+                continue;
+            }
+            entry.timer = None;
+            self.announce_again(topic, now);
+            self.values.handle_due(topic, now);
+            self.values.settle_arrival(topic);
+            self.values.schedule(topic);
+        }
+        self.look_at_claims(now);
+        self.look_at_calls(now);
+        self.inquire(now);
+        self.discover(now);
+        self.expire_chunks(now);
+        if let Some(guard) = &mut self.guard {
+            guard.turn(now.monotonic);
+            self.want_keys(now);
+        }
+    }
+
+    /// Returns the time of the next [`handle_timeout`](Self::handle_timeout).
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Instant> {
+        let timer = self.values.timers.peek().map(|Reverse((at, _))| *at);
+        let pace = match self.values.paced.is_empty() && !self.is_chunking() {
+            true => None,
+            false => self.values.pace.opens(),
+        };
+        let chunks = self.chunks.as_ref().and_then(|chunks| chunks.due());
+        let discovery = self.discovery_due();
+        let calls = self.calls.as_ref().and_then(|calls| calls.due());
+        let claims = self.values.claims.as_ref();
+        let claims =
+            claims.and_then(|claims| claims.due(self.values.mapping.pubsub().receive_timeout));
+        let keys = self.guard.as_ref().and_then(|guard| guard.due());
+        let redundancy = self.redundancy_due();
+        [
+            timer, pace, chunks, discovery, calls, claims, keys, redundancy,
+        ]
+        .into_iter()
+        .flatten()
+        .min()
+    }
+
+    /// Records that the local side published a delivery of the topic at `now`. The value is good.
+    pub fn published(&mut self, topic: TopicId, arrived: Timestamp, now: Now) {
+        self.values.hops.record(Hop::In, arrived, now.utc);
+        self.values.note(topic, || Crossing::Published {
+            after: now.utc.unix_nanos() - arrived.unix_nanos(),
+        });
+        self.values.is_good(topic, now);
+    }
+
+    /// Records that the local side did not publish a delivery with the topic and instance. Its
+    /// repetition will be delivered.
+    pub fn not_published(
+        &mut self,
+        topic: TopicId,
+        instance: Option<Timestamp>,
+        why: &'static str,
+    ) {
+        self.values.forget(topic, instance);
+        self.handed(topic, instance, Handover::Nobody);
+        self.values
+            .count(About::topic(topic), (Reason::NotPublished, why), 1, || {
+                why.to_owned()
+            });
+    }
+
+    /// Records that a service did not accept a value of the topic, or did not respond.
+    pub fn call_failed(&mut self, topic: TopicId, detail: &str) {
+        self.values
+            .count(About::topic(topic), Reason::CallFailed, 1, || {
+                detail.to_owned()
+            });
+    }
+
+    /// Records a publisher or subscriber of the topic with QoS policies that are incompatible with
+    /// the local side.
+    pub fn unmatched(&mut self, topic: TopicId) {
+        self.values
+            .count(About::topic(topic), Reason::IncompatibleQos, 1, String::new);
+    }
+
+    /// Counts samples that were lost before they reached the Router, such as in a queue of the port
+    /// or the kernel. They do not affect the state of a writer.
+    pub fn lost(
+        &mut self,
+        topic: Option<TopicId>,
+        count: u64,
+        (reason, why): (Reason, &'static str),
+    ) {
+        self.values
+            .count_only(About { topic, from: None }, (reason, why), count, || {
+                why.to_owned()
+            });
+    }
+
+    /// Counts drops of a port that belong to no topic.
+    pub fn dropped(&mut self, reason: Reason, count: u64, why: &'static str) {
+        let about = About {
+            topic: None,
+            from: None,
+        };
+        self.values
+            .count(about, (reason, why), count, || why.to_owned());
+    }
+
+    /// Takes back the buffer of a datagram or payload after use, so that the next output needs no
+    /// allocation.
+    pub fn recycle(&mut self, buffer: Vec<u8>) {
+        self.values.recycle(buffer);
+    }
+
+    /// Returns the counters of each topic in no particular order.
+    pub fn topics(&self) -> impl Iterator<Item = (TopicId, &Counters)> {
+        self.values
+            .topics
+            .iter()
+            .map(|(topic, entry)| (*topic, &entry.counters))
+    }
+
+    /// Returns the counters of datagrams and messages without a topic, and of removed topics.
+    #[must_use]
+    pub const fn others(&self) -> &Counters {
+        &self.values.others
+    }
+
+    /// Returns the measured delays.
+    #[must_use]
+    pub const fn hops(&self) -> &Hops {
+        &self.values.hops
+    }
+}
+
+impl Values {
+    /// Takes back the buffer of a datagram or payload.
+    fn recycle(&mut self, mut buffer: Vec<u8>) {
+        if self.spare.len() < SPARE_BUFFERS && buffer.capacity() <= SPARE_CAPACITY {
+            buffer.clear();
+            self.spare.push(buffer);
+        }
+    }
+
+    /// Binds a topic as [`Router::bind`] does. Returns whether it is a topic of the own space,
+    /// which is announced with its type.
+    pub(super) fn bind_type(
+        &mut self,
+        topic: TopicId,
+        (message_type, selection): (&Arc<MessageType>, &Selection),
+        now: Now,
+    ) -> Result<bool, PlanError> {
         let wire = match self.settings.local {
             Local::Ros1 => Wire::Ros1,
             Local::Cdr => Wire::Cdr,
             // A local side with fields as payload needs no plan.
-            Local::Fields => return Ok(()),
+            Local::Fields => return Ok(false),
         };
         let plan = self.plans.plan(message_type, selection, wire)?;
         let reactions = self.reactions(topic, (message_type, selection), wire)?;
@@ -198,28 +378,22 @@ impl Router {
                 Box::new(Transcoder::compile(origin, message_type, namespace))
             });
         let Some(entry) = self.follow(topic, None, now) else {
-            return Ok(());
+            return Ok(false);
         };
         entry.plan = Some(plan);
         entry.transcoder = transcoder;
         entry.bound = Some(Box::new((Arc::clone(message_type), selection.clone())));
         entry.react(reactions);
-        let held = match &mut entry.role {
-            Role::Theirs(reader) => {
-                reader.forget_all();
-                let held = reader.held.take();
-                self.drop_deliveries(topic, "its local type is another now");
-                held
-            }
-            Role::Ours(_) => {
-                self.describe(topic, Some((message_type, selection)), now);
-                None
-            }
+        let Role::Theirs(reader) = &mut entry.role else {
+            return Ok(true);
         };
+        reader.forget_all();
+        let held = reader.held.take();
+        self.drop_deliveries(topic, "its local type is another now");
         if let Some(held) = held {
             self.deliver_held(topic, &held, now);
         }
-        Ok(())
+        Ok(false)
     }
 
     /// Returns the reactions of a topic of another space to the loss of a commander.
@@ -234,21 +408,6 @@ impl Router {
         }
         let loss = Loss::new(&self.mapping, topic, of, wire)?;
         Ok((loss, trigger(&self.mapping, topic, of.0, wire)?))
-    }
-
-    /// Handles a sample received on the local side.
-    pub fn handle_local(&mut self, heard: Heard<'_>, now: Now) -> Verdict {
-        self.handle_local_as(heard, GOOD, now)
-    }
-
-    /// Handles a sample as [`handle_local`](Self::handle_local) does, with the quality of the
-    /// sample: the upper 16 bits of a StatusCode, which are sent as the Status of the
-    /// DataSetMessage (OPC 10000-14, 7.2.4.5.4).
-    pub fn handle_local_as(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
-        let topic = heard.topic;
-        let verdict = self.take_local(heard, status, now);
-        self.settle_verdict(topic, verdict);
-        verdict
     }
 
     fn take_local(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
@@ -387,7 +546,7 @@ impl Router {
             now.monotonic,
         );
         if is_confirmed {
-            self.look_for_confirmers(topic, now);
+            self.look_for_confirmers(topic);
         }
         if muted {
             self.adopt_followed(topic);
@@ -407,197 +566,6 @@ impl Router {
         } else {
             Verdict::Forward
         }
-    }
-
-    /// Removes a latched publisher of a topic of the own space. Its last message is not repeated
-    /// any more.
-    pub fn left(&mut self, topic: TopicId, publisher: PublisherKey, now: Now) {
-        let held = self
-            .topics
-            .get_mut(&topic)
-            .and_then(|entry| entry.gate.as_mut())
-            .and_then(|gate| gate.left(publisher, now.monotonic));
-        self.let_go(topic, held, now);
-        if let Some(Topic {
-            role: Role::Ours(writer),
-            ..
-        }) = self.topics.get_mut(&topic)
-        {
-            writer.forget(publisher);
-            self.schedule(topic);
-        }
-    }
-
-    /// Sets whether a topic of the own space has a producer. Without a producer its value is not
-    /// repeated, so that readers detect the silence. The next sample sets a producer again.
-    pub fn set_live(&mut self, topic: TopicId, live: bool, now: Now) {
-        if !live {
-            // The waiting sample is the last sample.
-            let held = self
-                .topics
-                .get_mut(&topic)
-                .and_then(|entry| entry.gate.as_mut())
-                .and_then(|gate| gate.hurry(now.monotonic));
-            self.let_go(topic, held, now);
-        }
-        if let Some(Topic {
-            role: Role::Ours(writer),
-            ..
-        }) = self.follow(topic, None, now)
-        {
-            let revived = live && !writer.is_live();
-            writer.set_live(live);
-            if revived && let Some(entry) = self.topics.get_mut(&topic) {
-                entry.announce_at = entry.announce_at.map(|_| now.monotonic);
-            }
-            if live && self.settings.local == Local::Fields {
-                // No local type will describe the topic.
-                self.describe(topic, None, now);
-            }
-            self.settle_arrival(topic);
-            self.schedule(topic);
-        }
-    }
-
-    /// Repeats values, sends keep-alives, and detects silent topics that are due by `now`.
-    pub fn handle_timeout(&mut self, now: Now) {
-        self.look_at_redundancy(now);
-        while let Some(Reverse((at, topic))) = self.timers.peek().copied() {
-            if at > now.monotonic {
-                break;
-            }
-            self.timers.pop();
-            let Some(entry) = self.topics.get_mut(&topic) else {
-                continue;
-            };
-            if entry.timer != Some(at) {
-                // A later entry has replaced this entry.
-                continue;
-            }
-            entry.timer = None;
-            self.announce_again(topic, now);
-            self.handle_due(topic, now);
-            self.settle_arrival(topic);
-            self.schedule(topic);
-        }
-        self.look_at_claims(now);
-        self.look_at_calls(now);
-        self.discover(now);
-        self.expire_chunks(now);
-        if let Some(guard) = &mut self.guard {
-            guard.turn(now.monotonic);
-            self.want_keys(now);
-        }
-    }
-
-    /// Returns the time of the next [`handle_timeout`](Self::handle_timeout).
-    #[must_use]
-    pub fn poll_timeout(&self) -> Option<Instant> {
-        let timer = self.timers.peek().map(|Reverse((at, _))| *at);
-        let pace = match self.paced.is_empty() && !self.is_chunking() {
-            true => None,
-            false => self.pace.opens(),
-        };
-        let chunks = self.chunks.as_ref().and_then(|chunks| chunks.due());
-        let discovery = self.discovery_due();
-        let calls = self.calls.as_ref().and_then(|calls| calls.due());
-        let claims = self.claims.as_ref();
-        let claims = claims.and_then(|claims| claims.due(self.mapping.pubsub().receive_timeout));
-        let keys = self.guard.as_ref().and_then(|guard| guard.due());
-        let redundancy = self.redundancy_due();
-        [
-            timer, pace, chunks, discovery, calls, claims, keys, redundancy,
-        ]
-        .into_iter()
-        .flatten()
-        .min()
-    }
-
-    /// Records that the local side published a delivery of the topic at `now`. The value is good.
-    pub fn published(&mut self, topic: TopicId, arrived: Timestamp, now: Now) {
-        self.hops.record(Hop::In, arrived, now.utc);
-        self.note(topic, || Crossing::Published {
-            after: now.utc.unix_nanos() - arrived.unix_nanos(),
-        });
-        self.is_good(topic, now);
-    }
-
-    /// Records that the local side did not publish a delivery with the topic and instance. Its
-    /// repetition will be delivered.
-    pub fn not_published(
-        &mut self,
-        topic: TopicId,
-        instance: Option<Timestamp>,
-        why: &'static str,
-    ) {
-        self.forget(topic, instance);
-        self.handed(topic, instance, Handover::Nobody);
-        self.count(About::topic(topic), (Reason::NotPublished, why), 1, || {
-            why.to_owned()
-        });
-    }
-
-    /// Records that a service did not accept a value of the topic, or did not respond.
-    pub fn call_failed(&mut self, topic: TopicId, detail: &str) {
-        self.count(About::topic(topic), Reason::CallFailed, 1, || {
-            detail.to_owned()
-        });
-    }
-
-    /// Records a publisher or subscriber of the topic with QoS policies that are incompatible with
-    /// the local side.
-    pub fn unmatched(&mut self, topic: TopicId) {
-        self.count(About::topic(topic), Reason::IncompatibleQos, 1, String::new);
-    }
-
-    /// Counts samples that were lost before they reached the Router, such as in a queue of the port
-    /// or the kernel. They do not affect the state of a writer.
-    pub fn lost(
-        &mut self,
-        topic: Option<TopicId>,
-        count: u64,
-        (reason, why): (Reason, &'static str),
-    ) {
-        self.count_only(About { topic, from: None }, (reason, why), count, || {
-            why.to_owned()
-        });
-    }
-
-    /// Counts drops of a port that belong to no topic.
-    pub fn dropped(&mut self, reason: Reason, count: u64, why: &'static str) {
-        let about = About {
-            topic: None,
-            from: None,
-        };
-        self.count(about, (reason, why), count, || why.to_owned());
-    }
-
-    /// Takes back the buffer of a datagram or payload after use, so that the next output needs no
-    /// allocation.
-    pub fn recycle(&mut self, mut buffer: Vec<u8>) {
-        if self.spare.len() < SPARE_BUFFERS && buffer.capacity() <= SPARE_CAPACITY {
-            buffer.clear();
-            self.spare.push(buffer);
-        }
-    }
-
-    /// Returns the counters of each topic in no particular order.
-    pub fn topics(&self) -> impl Iterator<Item = (TopicId, &Counters)> {
-        self.topics
-            .iter()
-            .map(|(topic, entry)| (*topic, &entry.counters))
-    }
-
-    /// Returns the counters of datagrams and messages without a topic, and of removed topics.
-    #[must_use]
-    pub const fn others(&self) -> &Counters {
-        &self.others
-    }
-
-    /// Returns the measured delays.
-    #[must_use]
-    pub const fn hops(&self) -> &Hops {
-        &self.hops
     }
 
     fn handle_due(&mut self, topic: TopicId, now: Now) {
@@ -819,11 +787,7 @@ impl Router {
 
     fn sizes(&self) -> (u16, u32) {
         let pubsub = self.mapping.pubsub();
-        let room = match self.guard {
-            // Sealing makes messages longer.
-            Some(_) => u16::try_from(Guard::OVERHEAD).unwrap_or_default(),
-            None => 0,
-        };
+        let room = u16::try_from(self.overhead).unwrap_or_default();
         let limit = self.relay.and_then(|relay| relay.limit);
         let most = limit.map_or(pubsub.max_datagram, |limit| limit.min(pubsub.max_datagram));
         let max_datagram = most.saturating_sub(room);

@@ -22,19 +22,23 @@ impl Router {
         message: Option<(&MessageType, &Selection)>,
         now: Now,
     ) {
-        let period = self.mapping.pubsub().metadata_period;
+        let period = self.values.mapping.pubsub().metadata_period;
         let Some(Topic {
             plan,
             said,
             description,
             announce_at,
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.values.topics.get_mut(&topic)
         else {
             return;
         };
         let said = said.as_deref();
-        let variable = self.mapping.variable(topic).filter(|_| said.is_none());
+        let variable = self
+            .values
+            .mapping
+            .variable(topic)
+            .filter(|_| said.is_none());
         let mapped = match (message, variable) {
             (None, Some(variable)) => mapped_leaves(variable),
             (Some(_), _) | (None, None) => Vec::new(),
@@ -55,7 +59,7 @@ impl Router {
             leaves,
             variable,
             said,
-            namespaces: self.mapping.namespaces(),
+            namespaces: self.values.mapping.namespaces(),
         };
         match Description::new(source, description.as_deref(), now.utc) {
             Ok(new) if new.differs(description.as_deref()) => {
@@ -65,9 +69,10 @@ impl Router {
             Ok(_) => return,
             Err(error) => {
                 *description = None;
-                self.count(About::topic(topic), Reason::MetaData, 1, || {
-                    format!("what it consists of cannot be announced: {error}")
-                });
+                self.values
+                    .count(About::topic(topic), Reason::MetaData, 1, || {
+                        format!("what it consists of cannot be announced: {error}")
+                    });
                 return;
             }
         }
@@ -79,17 +84,17 @@ impl Router {
         }
         discovery.announcer.add_writer(namespace, writer_id);
         discovery.plan(topic, now);
-        self.schedule(topic);
+        self.values.schedule(topic);
     }
 
     /// Plans the next announcement of a topic, if it is due and the topic has a producer.
     pub(super) fn announce_again(&mut self, topic: TopicId, now: Now) {
-        let period = self.mapping.pubsub().metadata_period;
+        let period = self.values.mapping.pubsub().metadata_period;
         let Some(Topic {
             role: Role::Ours(writer),
             announce_at: Some(at),
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.values.topics.get_mut(&topic)
         else {
             return;
         };
@@ -103,15 +108,15 @@ impl Router {
     }
 
     pub(super) fn announce(&mut self, topic: TopicId, sequence_number: u16, now: Now) {
-        if self.is_withheld(topic) {
+        if self.values.is_withheld(topic) {
             return;
         }
-        let mut bytes = self.buffer();
+        let mut bytes = self.values.buffer();
         let Some(Topic {
             description: Some(description),
             counters,
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.values.topics.get_mut(&topic)
         else {
             return;
         };
@@ -128,21 +133,23 @@ impl Router {
         (bytes, body_at): (Vec<u8>, usize),
         now: Now,
     ) {
-        let (max_datagram, _) = self.sizes();
+        let (max_datagram, _) = self.values.sizes();
         if bytes.len() <= usize::from(max_datagram) {
-            self.tell(Output::Discovery { bytes });
+            self.values.tell(Output::Discovery { bytes });
             return;
         }
         let body = bytes.get(body_at..).unwrap_or_default();
         match announcement_chunks(topic.space, sequence_number, body, (max_datagram, now.utc)) {
             Ok(chunks) => {
                 for bytes in chunks {
-                    self.tell(Output::Discovery { bytes });
+                    self.values.tell(Output::Discovery { bytes });
                 }
             }
-            Err(error) => self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string()),
+            Err(error) => self
+                .values
+                .count(About::topic(topic), Reason::TooBig, 1, || error.to_string()),
         }
-        self.recycle(bytes);
+        self.values.recycle(bytes);
     }
 
     /// Responds to a probe for a DataSetWriter that does not exist.
@@ -155,13 +162,13 @@ impl Router {
                 status: BAD_NOT_FOUND,
             },
         };
-        let mut bytes = self.buffer();
-        let publisher = PublisherId::UInt16(self.settings.own.into());
+        let mut bytes = self.values.buffer();
+        let publisher = PublisherId::UInt16(self.values.settings.own.into());
         if announcement
             .encode(publisher, SecurityHeader::NONE, &mut bytes)
             .is_ok()
         {
-            self.tell(Output::Discovery { bytes });
+            self.values.tell(Output::Discovery { bytes });
         }
     }
 }

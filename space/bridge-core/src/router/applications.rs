@@ -84,7 +84,7 @@ impl Router {
         {
             return false;
         }
-        let ours = self.settings.source.is_some() && self.is_source(from);
+        let ours = self.values.settings.source.is_some() && self.values.is_source(from);
         if !ours {
             self.is_asked(&Probe::FindApplications, now);
         }
@@ -114,11 +114,11 @@ impl Router {
         match asking.poll(since, random) {
             ProbeStep::Wait => {}
             ProbeStep::Send => {
-                let mut bytes = self.buffer();
+                let mut bytes = self.values.buffer();
                 let encoded =
                     Probe::FindApplications.encode(None, SecurityHeader::NONE, &mut bytes);
                 if encoded.is_ok() {
-                    self.tell(Output::Discovery { bytes });
+                    self.values.tell(Output::Discovery { bytes });
                 }
             }
             ProbeStep::Answered | ProbeStep::GivenUp => discovery.applications.asking = None,
@@ -135,24 +135,24 @@ impl Router {
         let Some(own) = &discovery.applications.own else {
             return;
         };
-        let mut bytes = self.buffer();
-        let head = (self.settings.own, sequence_number);
+        let mut bytes = self.values.buffer();
+        let head = (self.values.settings.own, sequence_number);
         let encoded = match endpoints {
             false => own.announce(head, &mut bytes),
             true => own.announce_endpoints(head, &mut bytes),
         };
-        let (max_datagram, _) = self.sizes();
+        let (max_datagram, _) = self.values.sizes();
         match encoded {
             Ok(()) if bytes.len() <= usize::from(max_datagram) => {
-                self.tell(Output::Discovery { bytes });
+                self.values.tell(Output::Discovery { bytes });
             }
             Ok(()) | Err(_) => {
-                self.recycle(bytes);
+                self.values.recycle(bytes);
                 let what = About {
                     topic: None,
                     from: None,
                 };
-                self.count(what, Reason::TooBig, 1, || {
+                self.values.count(what, Reason::TooBig, 1, || {
                     "what this program is does not fit a datagram".to_owned()
                 });
             }
@@ -167,7 +167,7 @@ impl Router {
         now: Now,
     ) {
         let Some(application) = Application::read(description, capabilities) else {
-            self.count(
+            self.values.count(
                 About::sender(from),
                 (Reason::MetaData, "application"),
                 1,

@@ -2,15 +2,14 @@
 
 use mappings::{Overflow, TopicId};
 
-use super::{About, Crossing, Router};
+use super::{About, Crossing, Values};
 use crate::counters::Reason;
-use crate::guard::Guard;
 use crate::network::join;
 use crate::output::Output;
 use crate::settings::Now;
 use crate::writer::Encoded;
 
-impl Router {
+impl Values {
     /// Returns the datagram of a sample, together with other waiting samples of its WriterGroup if
     /// the mapping allows it.
     pub(super) fn datagram(
@@ -60,10 +59,9 @@ impl Router {
         let mut gathered = Vec::new();
         let pubsub = self.mapping.pubsub();
         let most = usize::from(pubsub.messages_per_datagram);
-        let overhead = self.guard.as_ref().map_or(0, |_| Guard::OVERHEAD);
         let room = usize::from(pubsub.max_datagram)
             .min(ETHERNET)
-            .saturating_sub(overhead);
+            .saturating_sub(self.overhead);
         // With several messages, the first message also has an entry in Sizes.
         let mut len = first.bytes.len() + SIZE;
         let mut passed = Vec::new();

@@ -6,7 +6,7 @@ use mappings::{FieldMap, Lasting, TopicId};
 use messages::{MessageType, Plan, PlanError, Selection};
 use uadp::Fields;
 
-use super::{About, Router};
+use super::{About, Router, Values};
 use crate::call::{CallDescription, CallField, CallRole, Origin, ValueDescription, ValueNote};
 use crate::call_plan;
 use crate::counters::{Cause, Reason};
@@ -66,7 +66,7 @@ impl Router {
             overflow,
             map,
         } = note;
-        let Some(entry) = self.follow(topic, None, now) else {
+        let Some(entry) = self.values.follow(topic, None, now) else {
             return Ok(());
         };
         let ours = matches!(entry.role, Role::Ours(_));
@@ -88,20 +88,22 @@ impl Router {
         }
         let rules = (overflow, Lasting::from(overflow));
         if (entry.overflow, entry.lasting) != rules {
-            self.requeue(topic, rules);
+            self.values.requeue(topic, rules);
         }
         if ours {
             return self.bind(topic, message_type, &Selection::Whole, now);
         }
-        self.arrange(topic, now);
+        self.values.arrange(topic, now);
+        self.inquire(now);
         Ok(())
     }
+}
 
+impl Values {
     /// Assigns the fields of a value to its message, if the value is bound by name. Returns false
     /// for other values.
     pub(super) fn arrange(&mut self, topic: TopicId, now: Now) -> bool {
-        let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
-        let described = learned.and_then(|learned| learned.get(topic, now.monotonic));
+        let described = self.learned.get(topic, now.monotonic);
         let Some(Topic {
             by_name: Some(by_name),
             ..
@@ -110,7 +112,7 @@ impl Router {
             return false;
         };
         let Some(described) = described.cloned() else {
-            self.ask_what(topic, now);
+            self.ask_what(topic);
             return true;
         };
         if let Some((known, _)) = &by_name.arranged
@@ -122,7 +124,7 @@ impl Router {
         let bound = match order(&described, (&message_type, &by_name.map)) {
             Ok((selection, order)) => {
                 by_name.arranged = Some((described, order));
-                let bound = self.bind(topic, &message_type, &selection, now);
+                let bound = self.bind_type(topic, (&message_type, &selection), now);
                 bound.map_err(|error| error.to_string())
             }
             Err(why) => Err(why),

@@ -178,8 +178,8 @@ impl Router {
     }
 
     fn calls_mut(&mut self, now: Now) -> &mut Calls {
-        let (own, instance) = (self.settings.own, self.instance);
-        let timeout = self.mapping.pubsub().receive_timeout;
+        let (own, instance) = (self.values.settings.own, self.instance);
+        let timeout = self.values.mapping.pubsub().receive_timeout;
         self.calls
             .get_or_insert_with(|| Box::new(Calls::new(own, instance, timeout, now.monotonic)))
     }
@@ -211,7 +211,7 @@ impl Router {
         (service, map): (&Arc<ServiceType>, &Arc<CallMap>),
         now: Now,
     ) -> Result<(), String> {
-        if self.wire().is_none() || self.is_home(topic) {
+        if self.wire().is_none() || self.values.is_home(topic) {
             return Ok(());
         }
         self.calls_mut(now).table.entry(topic).or_default().bound = Some(Bound {
@@ -225,7 +225,7 @@ impl Router {
     }
 
     fn wire(&self) -> Option<Wire> {
-        match self.settings.local {
+        match self.values.settings.local {
             Local::Ros1 => Some(Wire::Ros1),
             Local::Cdr => Some(Wire::Cdr),
             Local::Fields => None,
@@ -249,7 +249,7 @@ impl Router {
         let plan = CallPlan::compile(
             &known.description,
             (&bound.service, &bound.map),
-            (wire, &mut self.plans),
+            (wire, &mut self.values.plans),
         );
         let outcome = plan.as_ref().map(|_| ()).map_err(Clone::clone);
         bound.plan = Some(plan.map(Arc::new));
@@ -267,7 +267,7 @@ impl Router {
     /// Records that the local side has a client for a call. If the call is not known, its executor
     /// is probed.
     pub fn want_call(&mut self, topic: TopicId, now: Now) {
-        if self.described_call(topic).is_none() && !self.is_home(topic) {
+        if self.described_call(topic).is_none() && !self.values.is_home(topic) {
             self.plan_probe(topic, now);
         }
     }
@@ -318,7 +318,7 @@ impl Router {
                 AskError::refused(refusal, text),
             )
         };
-        if !self.may_cross(Side::Local, What::Request, topic) {
+        if !self.values.may_cross(Side::Local, What::Request, topic) {
             let text = format!("{topic} is executed here: nobody else can be asked");
             return Err((
                 Reason::Looped.into(),
@@ -420,26 +420,31 @@ impl Router {
     ) {
         let actions = match message.actions(ActionDialect::Standard) {
             Ok(actions) => actions,
-            Err(error) => return self.drop_undecoded(None, from, &error),
+            Err(error) => return self.values.drop_undecoded(None, from, &error),
         };
         for action in actions {
             let action = match action {
                 Ok(action) => action,
                 Err(error) => {
-                    self.drop_undecoded(None, from, &error);
+                    self.values.drop_undecoded(None, from, &error);
                     continue;
                 }
             };
             let namespace = action.writer_group_id.unwrap_or_default();
             let topic = TopicId::new(u16::from(space.get()), namespace, action.writer_id);
             match (topic, action.action.kind) {
-                (None, _) => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
-                (Some(topic), ActionKind::Request) if self.is_untimed(&message.header()) => {
+                (None, _) => {
+                    self.values
+                        .count(About::sender(from), Reason::NotInSpace, 1, String::new)
+                }
+                (Some(topic), ActionKind::Request) if self.values.is_untimed(&message.header()) => {
                     let cause = late::cause(late::UNTIMED);
                     self.count_call(topic, Some(from), cause, || late::NO_TIME.to_owned());
                 }
                 (Some(topic), ActionKind::Request)
-                    if self.is_given_up(&message.header(), action.action.timeout(), now) =>
+                    if self
+                        .values
+                        .is_given_up(&message.header(), action.action.timeout(), now) =>
                 {
                     let cause = late::cause(late::GIVEN_UP);
                     self.count_call(topic, Some(from), cause, || {
@@ -466,12 +471,14 @@ impl Router {
         from: SocketAddr,
         now: Now,
     ) {
-        if !self.may_cross(Side::Ua, What::Response, topic) {
+        if !self.values.may_cross(Side::Ua, What::Response, topic) {
             let (_, namespace, _) = topic.triple();
-            return self.drop_own(Some(namespace), from, now);
+            return self.values.drop_own(Some(namespace), from, now);
         }
         let Some(calls) = &mut self.calls else {
-            return self.count(About::sender(from), Reason::NotAsked, 1, String::new);
+            return self
+                .values
+                .count(About::sender(from), Reason::NotAsked, 1, String::new);
         };
         let since = calls.since_start(now);
         let known = calls.table.get(&topic).and_then(|call| call.known.as_ref());
@@ -509,7 +516,7 @@ impl Router {
             return;
         };
         let Asked { ask, topic, plan } = asked;
-        let mut response = self.buffer();
+        let mut response = self.values.buffer();
         let (answer, cause) = match outcome {
             Outcome::Answered { status, fields } if status.0 & BAD == 0 => {
                 match read(fields, plan.as_deref(), &mut response) {
@@ -596,18 +603,18 @@ impl Router {
             if let Some(chunk) = self.next_chunk(now) {
                 return Some(chunk);
             }
-            let mut bytes = self.spare.pop().unwrap_or_default();
+            let mut bytes = self.values.spare.pop().unwrap_or_default();
             match self.write_action(&mut bytes, now) {
                 Some(Told::Datagram(topic, _)) if bytes.len() <= self.most() => {
                     return Some(Output::Action { topic, bytes });
                 }
                 Some(Told::Datagram(topic, of)) => self.cut_up(topic, of, bytes),
                 Some(Told::News(output)) => {
-                    self.recycle(bytes);
+                    self.values.recycle(bytes);
                     return Some(output);
                 }
                 None => {
-                    self.recycle(bytes);
+                    self.values.recycle(bytes);
                     return None;
                 }
             }
@@ -615,7 +622,7 @@ impl Router {
     }
 
     fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
-        let header = self.action_header(now);
+        let header = self.values.action_header(now);
         loop {
             let calls = self.calls.as_mut()?;
             if let Some(news) = calls.news.pop_front() {
@@ -639,7 +646,7 @@ impl Router {
                     let calls = self.calls.as_mut()?;
                     return calls.news.pop_front().map(Told::News);
                 }
-                Some((of, (Some(topic), Ok(())))) if !self.is_withheld(topic) => {
+                Some((of, (Some(topic), Ok(())))) if !self.values.is_withheld(topic) => {
                     return Some(Told::Datagram(topic, of));
                 }
                 Some((_, (Some(topic), Ok(())))) => {
@@ -668,14 +675,15 @@ impl Router {
         let call = self.calls.as_mut();
         let counters = match call.and_then(|calls| calls.table.get_mut(&topic)) {
             Some(call) => &mut call.counters.drops,
-            None => &mut self.others,
+            None => &mut self.values.others,
         };
         let total = counters.add(cause, 1);
         let about = About {
             topic: Some(topic),
             from,
         };
-        self.tell_of_drop(about, cause, (total.saturating_sub(1), total), detail);
+        self.values
+            .tell_of_drop(about, cause, (total.saturating_sub(1), total), detail);
     }
 }
 

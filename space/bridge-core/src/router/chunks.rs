@@ -11,7 +11,7 @@ use uadp::{
 };
 
 use super::receive::{number_of, sent};
-use super::{About, Router};
+use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
@@ -75,17 +75,18 @@ impl Router {
         let writer_id = message.writer_ids().and_then(|mut ids| ids.next());
         let topic = writer_id.and_then(|id| TopicId::new(u16::from(space.get()), namespace, id));
         if writer_id.is_some() && topic.is_none() {
-            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            self.values
+                .count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         }
-        if topic.is_some_and(|topic| !self.hear(topic, from, now)) {
+        if topic.is_some_and(|topic| !self.values.hear(topic, from, now)) {
             return;
         }
         // Taken out of `self` during the handling of the complete message, to avoid a copy.
         let mut chunks = self
             .chunks
             .take()
-            .unwrap_or_else(|| Box::new(Chunks::new(self.mapping.pubsub(), now.monotonic)));
+            .unwrap_or_else(|| Box::new(Chunks::new(self.values.mapping.pubsub(), now.monotonic)));
         let since = chunks.since_start(now);
         let received = chunks.reassembler.receive_from(from, message, since);
         let large = matches!(&received, Ok(Some(whole)) if whole.bytes.len() > MAX_SPARE);
@@ -94,29 +95,34 @@ impl Router {
             Ok(Some(whole)) if whole.message_type == NetworkMessageType::Announcement => {
                 match Announcement::decode_body(whole.bytes) {
                     Ok(announcement) => self.learn(&announcement, (space, from), now),
-                    Err(error) => self.drop_undecoded(None, from, &error),
+                    Err(error) => self.values.drop_undecoded(None, from, &error),
                 }
             }
             Ok(Some(whole)) => match topic {
                 Some(topic) => match whole.data_set_message() {
                     Ok(message) => {
-                        self.handle_message(topic, &message, (from, sent(&whole.header)), now);
+                        self.values.handle_message(
+                            topic,
+                            &message,
+                            (from, sent(&whole.header)),
+                            now,
+                        );
                     }
-                    Err(error) => self.drop_undecoded(Some(topic), from, &error),
+                    Err(error) => self.values.drop_undecoded(Some(topic), from, &error),
                 },
                 // Without a payload header the chunks contain an encoded NetworkMessage.
                 None => match NetworkMessage::decode(whole.bytes) {
                     Ok(message) if message.is_chunk() => {
-                        self.drop_undecoded(None, from, &CHUNK_IN_CHUNKS);
+                        self.values.drop_undecoded(None, from, &CHUNK_IN_CHUNKS);
                     }
                     Ok(message) if self.is_smuggled(&message, namespace) => {
                         let cause = (Reason::Unsecured, "in chunks");
-                        self.count(About::sender(from), cause, 1, || {
+                        self.values.count(About::sender(from), cause, 1, || {
                             "a message of a secured group in chunks of another".to_owned()
                         });
                     }
                     Ok(message) => self.handle_network_message(&message, from, now),
-                    Err(error) => self.drop_undecoded(None, from, &error),
+                    Err(error) => self.values.drop_undecoded(None, from, &error),
                 },
             },
             Err(refusal) => {
@@ -124,9 +130,9 @@ impl Router {
                     topic,
                     from: Some(from),
                 };
-                let most = self.mapping.pubsub().max_message >> 20;
+                let most = self.values.mapping.pubsub().max_message >> 20;
                 let cause = (reason_of(refusal), case_of(refusal));
-                self.count(about, cause, 1, || told(refusal, most));
+                self.values.count(about, cause, 1, || told(refusal, most));
             }
         }
         if large {
@@ -162,6 +168,30 @@ impl Router {
         }
     }
 
+    fn count_given_up(&mut self, reassembler: &mut Reassembler<SocketAddr>) {
+        while let Some(given_up) = reassembler.poll_given_up() {
+            let reason = match given_up.why {
+                GiveUp::Expired | GiveUp::Superseded | GiveUp::Contradicted => Reason::Incomplete,
+                GiveUp::OutOfBytes | GiveUp::OutOfPlaces => Reason::NoRoom,
+            };
+            let about = About {
+                topic: topic_of(&given_up),
+                from: Some(given_up.sender),
+            };
+            self.values.count(about, (reason, why(given_up.why)), 1, || {
+                format!(
+                    "of a message of {} bytes only {} came ({}); a larger receive buffer may help, see \
+                     net.core.rmem_max",
+                    given_up.total_size,
+                    given_up.received,
+                    why(given_up.why)
+                )
+            });
+        }
+    }
+}
+
+impl Values {
     /// Records a message of the writer of a topic. Returns false if there is no room for the topic.
     fn hear(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
         let Some(Topic {
@@ -176,28 +206,6 @@ impl Router {
             self.tell_returned(topic);
         }
         true
-    }
-
-    fn count_given_up(&mut self, reassembler: &mut Reassembler<SocketAddr>) {
-        while let Some(given_up) = reassembler.poll_given_up() {
-            let reason = match given_up.why {
-                GiveUp::Expired | GiveUp::Superseded | GiveUp::Contradicted => Reason::Incomplete,
-                GiveUp::OutOfBytes | GiveUp::OutOfPlaces => Reason::NoRoom,
-            };
-            let about = About {
-                topic: topic_of(&given_up),
-                from: Some(given_up.sender),
-            };
-            self.count(about, (reason, why(given_up.why)), 1, || {
-                format!(
-                    "of a message of {} bytes only {} came ({}); a larger receive buffer may help, see \
-                     net.core.rmem_max",
-                    given_up.total_size,
-                    given_up.received,
-                    why(given_up.why)
-                )
-            });
-        }
     }
 }
 

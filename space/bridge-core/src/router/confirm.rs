@@ -7,7 +7,7 @@ use mappings::{SpaceId, TopicId};
 use uadp::Timestamp;
 use uadp::action::ActionMessage;
 
-use super::{About, Router};
+use super::{About, Router, Values};
 use crate::confirm::{self, Arrival, Confirmer, Handover, Mark, Receipt, Reply};
 use crate::counters::{Reason, Verdict};
 use crate::output::{Kept, Output};
@@ -21,7 +21,8 @@ impl Router {
     /// with [`handed`](Self::handed).
     #[must_use]
     pub fn is_to_confirm(&self, topic: TopicId, instance: Option<Timestamp>) -> bool {
-        self.receipt(topic)
+        self.values
+            .receipt(topic)
             .is_some_and(|receipt| Some(receipt.mark.stamp) == instance)
     }
 
@@ -32,7 +33,7 @@ impl Router {
         let Some(Topic {
             role: Role::Theirs(reader),
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.values.topics.get_mut(&topic)
         else {
             return;
         };
@@ -43,12 +44,67 @@ impl Router {
         receipt.handed(handover);
         let mark = receipt.mark;
         match handover {
-            Handover::Done => self.send_confirmation(topic, mark),
+            Handover::Done => self.values.send_confirmation(topic, mark),
             Handover::Waiting => {}
             Handover::Nobody => reader.forget(instance),
         }
     }
 
+    /// Handles a confirmation of the space. Returns false for a response to a request.
+    pub(super) fn is_confirmation(
+        &mut self,
+        response: &ActionMessage<'_>,
+        (space, from): (SpaceId, SocketAddr),
+        now: Now,
+    ) -> bool {
+        let Some((topic, mark)) = confirm::decode(response) else {
+            return false;
+        };
+        // Confirmations go to the whole group.
+        let is_own = self.values.settings.source.is_some() && self.values.is_source(from);
+        if !self.values.is_home(topic) || is_own {
+            return true;
+        }
+        let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.values.topics.get_mut(&topic)
+        else {
+            return true;
+        };
+        let about = About {
+            topic: Some(topic),
+            from: Some(from),
+        };
+        if !writer.is_awaited(mark, space) {
+            let cause = (Reason::NotAsked, "confirmation");
+            self.values.count_only(about, cause, 1, String::new);
+            return true;
+        }
+        let confirmer = self.values.confirmers.get_mut(&space);
+        let counts = confirmer.is_some_and(|of| of.counts(from, now.monotonic));
+        if !counts && !self.is_active_sender(space, from) {
+            // The announcement of the bridge may have been lost.
+            self.ask_applications(now);
+            let cause = (Reason::Forged, "confirmation");
+            self.values.count_only(about, cause, 1, || {
+                format!("{from} confirms for space {space}, which it did not announce or another sender did first")
+            });
+            return true;
+        }
+        if let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.values.topics.get_mut(&topic)
+        {
+            writer.confirm(space);
+        }
+        self.values.settle_arrival(topic);
+        true
+    }
+}
+
+impl Values {
     fn receipt(&self, topic: TopicId) -> Option<&Receipt> {
         match &self.topics.get(&topic)?.role {
             Role::Theirs(reader) => reader.receipt.as_ref(),
@@ -129,66 +185,13 @@ impl Router {
             .announced(from);
     }
 
-    /// Handles a confirmation of the space. Returns false for a response to a request.
-    pub(super) fn is_confirmation(
-        &mut self,
-        response: &ActionMessage<'_>,
-        (space, from): (SpaceId, SocketAddr),
-        now: Now,
-    ) -> bool {
-        let Some((topic, mark)) = confirm::decode(response) else {
-            return false;
-        };
-        // Confirmations go to the whole group.
-        let is_own = self.settings.source.is_some() && self.is_source(from);
-        if !self.is_home(topic) || is_own {
-            return true;
-        }
-        let Some(Topic {
-            role: Role::Ours(writer),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
-            return true;
-        };
-        let about = About {
-            topic: Some(topic),
-            from: Some(from),
-        };
-        if !writer.is_awaited(mark, space) {
-            let cause = (Reason::NotAsked, "confirmation");
-            self.count_only(about, cause, 1, String::new);
-            return true;
-        }
-        let confirmer = self.confirmers.get_mut(&space);
-        let counts = confirmer.is_some_and(|of| of.counts(from, now.monotonic));
-        if !counts && !self.is_active_sender(space, from) {
-            // The announcement of the bridge may have been lost.
-            self.ask_applications(now);
-            let cause = (Reason::Forged, "confirmation");
-            self.count_only(about, cause, 1, || {
-                format!("{from} confirms for space {space}, which it did not announce or another sender did first")
-            });
-            return true;
-        }
-        if let Some(Topic {
-            role: Role::Ours(writer),
-            ..
-        }) = self.topics.get_mut(&topic)
-        {
-            writer.confirm(space);
-        }
-        self.settle_arrival(topic);
-        true
-    }
-
     /// Probes for applications if a bridge that confirms the newest event is unknown.
-    pub(super) fn look_for_confirmers(&mut self, topic: TopicId, now: Now) {
+    pub(super) fn look_for_confirmers(&mut self, topic: TopicId) {
         let confirming = self.topics.get(&topic);
         let confirming = confirming.and_then(|of| of.confirming.as_deref());
         let is_known = |space: &SpaceId| self.confirmers.contains_key(space);
         if confirming.is_some_and(|of| !of.spaces.iter().all(is_known)) {
-            self.ask_applications(now);
+            self.inquiries.look_for_applications();
         }
     }
 

@@ -11,7 +11,7 @@ use uadp::{
     Scalar, StatusCode, Timestamp, Variant,
 };
 
-use super::{About, Router};
+use super::{About, Values};
 use crate::base::Base;
 use crate::counters::Reason;
 use crate::layout::Layout;
@@ -84,7 +84,7 @@ impl Quality {
     }
 }
 
-impl Router {
+impl Values {
     /// Stores a key frame for later delta frames, and returns the selection of its fields.
     pub(super) fn take_base(
         &mut self,
@@ -214,7 +214,7 @@ impl Router {
 
     /// Returns the layout of a topic if the sender announced it.
     fn announced(&self, topic: TopicId, from: SocketAddr) -> Option<&Arc<Layout>> {
-        let layout = self.discovery.as_ref()?.layout(topic)?;
+        let layout = self.layouts.last(topic)?;
         Some(layout).filter(|layout| layout.is_of(from))
     }
 

@@ -2,7 +2,6 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::net::SocketAddr;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use mappings::{Mapping, SpaceId, TopicId};
@@ -14,12 +13,12 @@ use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader, Stat
 
 use super::applications::Applications;
 use super::receive::DISCOVERY;
-use super::{About, Router};
+use super::{About, Router, Values};
 use crate::call::split_name;
 use crate::counters::Reason;
 use crate::description::Described;
 use crate::layout::Layout;
-use crate::learned::{Learned, News, Rank};
+use crate::learned::{News, Rank};
 use crate::loop_rule::Owned;
 use crate::output::Output;
 use crate::reader::Ask;
@@ -42,9 +41,6 @@ pub(super) struct Discovery {
     pub(super) met: HashSet<(SpaceId, u16)>,
     /// The Publishers that are probed for metadata.
     probing: BTreeMap<SpaceId, Probing>,
-    pub(super) learned: Learned<Described>,
-    /// The announced fields, for messages that do not describe their fields.
-    layouts: Learned<Layout>,
     pub(super) applications: Applications,
     /// The time of the next action. It is read in every iteration and computed only after changes.
     due: Option<Instant>,
@@ -72,16 +68,9 @@ impl Discovery {
             rolls: BTreeMap::new(),
             met: HashSet::new(),
             probing: BTreeMap::new(),
-            learned: Learned::default(),
-            layouts: Learned::default(),
             applications: Applications::default(),
             due: None,
         }
-    }
-
-    /// Returns the last announced fields of a topic.
-    pub(super) fn layout(&self, topic: TopicId) -> Option<&Arc<Layout>> {
-        self.layouts.last(topic)
     }
 
     pub(super) fn since_start(&self, now: Now) -> Duration {
@@ -126,7 +115,7 @@ impl Discovery {
 
 impl Router {
     pub(super) fn discovery(&mut self, now: Now) -> &mut Discovery {
-        let own = self.settings.own;
+        let own = self.values.settings.own;
         self.discovery
             .get_or_insert_with(|| Box::new(Discovery::new(own, now.monotonic)))
     }
@@ -168,7 +157,7 @@ impl Router {
                 self.announce_call(*topic, due.sequence_number, now);
             }
             // If several programs share the space, another program may have the writer.
-            if values.is_none() && calls.is_none() && self.owned == Owned::All {
+            if values.is_none() && calls.is_none() && self.values.owned == Owned::All {
                 self.deny(writer_id, due.sequence_number);
             }
         }
@@ -200,37 +189,13 @@ impl Router {
     fn probe(&mut self, space: SpaceId, topics: &BTreeSet<TopicId>) {
         let ids: BTreeSet<u16> = topics.iter().map(|topic| topic.triple().2).collect();
         let ids: Vec<u16> = ids.into_iter().take(MAX_ASKED).collect();
-        let mut bytes = self.buffer();
+        let mut bytes = self.values.buffer();
         let publisher = Some(PublisherId::UInt16(space.into()));
         if Probe::DataSetMetaData(List::new(&ids))
             .encode(publisher, SecurityHeader::NONE, &mut bytes)
             .is_ok()
         {
-            self.tell(Output::Discovery { bytes });
-        }
-    }
-
-    /// Plans a probe for the metadata of a topic of another space.
-    pub(super) fn ask_what(&mut self, topic: TopicId, now: Now) {
-        if self.is_learned(topic) {
-            self.plan_probe(topic, now);
-        }
-    }
-
-    /// Plans a probe for the fields of a topic if its messages cannot be read without them. The
-    /// rate of these probes is limited.
-    pub(super) fn ask_layout(&mut self, topic: TopicId, now: Now) {
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
-            return;
-        };
-        let before = reader.asked_layout;
-        if before.is_none_or(|asked| now.monotonic >= asked + ASK_LAYOUT_AGAIN) {
-            reader.asked_layout = Some(now.monotonic);
-            self.plan_probe(topic, now);
+            self.values.tell(Output::Discovery { bytes });
         }
     }
 
@@ -252,17 +217,6 @@ impl Router {
         discovery.reckon();
     }
 
-    /// Returns whether the local type of a topic may come from its writer, because the mapping does
-    /// not define it.
-    fn is_learned(&self, topic: TopicId) -> bool {
-        let own = self.settings.own;
-        let bound = self.mapping.variable(topic).is_some_and(|variable| {
-            let service = variable.service.as_ref();
-            variable.binding(own).is_some() || service.is_some_and(|service| service.space == own)
-        });
-        self.settings.local != Local::Fields && !bound
-    }
-
     /// Handles a probe or an announcement from or to the Publisher of `space`.
     pub(super) fn handle_discovery(
         &mut self,
@@ -274,39 +228,41 @@ impl Router {
             match Probe::decode(message) {
                 Ok(Probe::DataSetMetaData(ids)) => self.handle_probe(ids, space, now),
                 // Own probes are received, too.
-                Ok(Probe::PubSubConnections { .. }) if !self.is_source(from) => {
+                Ok(Probe::PubSubConnections { .. }) if !self.values.is_source(from) => {
                     self.handle_roll(space, now);
                 }
                 Ok(Probe::PubSubConnections { .. }) => {}
                 Ok(probe @ (Probe::PublisherEndpoints | Probe::FindApplications)) => {
                     let is_all = probe == Probe::FindApplications;
-                    if is_all || space == self.settings.own {
+                    if is_all || space == self.values.settings.own {
                         self.is_asked(&probe, now);
                     }
                 }
                 // Probes for configurations are not supported.
-                Ok(_) => self.drop_undecoded(None, from, &DISCOVERY),
-                Err(error) => self.drop_undecoded(None, from, &error),
+                Ok(_) => self.values.drop_undecoded(None, from, &DISCOVERY),
+                Err(error) => self.values.drop_undecoded(None, from, &error),
             }
-        } else if space == self.settings.own && (self.owned == Owned::All || self.is_source(from)) {
+        } else if space == self.values.settings.own
+            && (self.values.owned == Owned::All || self.values.is_source(from))
+        {
             if !self.follow_peer(message, None, from, now) {
-                self.drop_own(None, from, now);
+                self.values.drop_own(None, from, now);
             }
         } else if message.is_chunk() && !message.is_sealed() {
             self.handle_chunk(message, (space, 0), from, now);
         } else {
             match Announcement::decode(message) {
                 Ok(announcement) => {
-                    self.meet_confirmer(space, from);
+                    self.values.meet_confirmer(space, from);
                     self.learn(&announcement, (space, from), now);
                 }
-                Err(error) => self.drop_undecoded(None, from, &error),
+                Err(error) => self.values.drop_undecoded(None, from, &error),
             }
         }
     }
 
     fn handle_probe(&mut self, ids: List<'_, u16>, asked: SpaceId, now: Now) {
-        let own = self.settings.own;
+        let own = self.values.settings.own;
         let discovery = self.discovery(now);
         let since = discovery.since_start(now);
         if asked == own {
@@ -352,7 +308,7 @@ impl Router {
             status,
         } = &announcement.announced
         else {
-            self.drop_undecoded(None, from, &DISCOVERY);
+            self.values.drop_undecoded(None, from, &DISCOVERY);
             return;
         };
         let named = meta_data.name.and_then(split_name);
@@ -368,49 +324,54 @@ impl Router {
             topic: Some(topic),
             from: Some(from),
         };
-        if !self.may_say(topic, from, now) {
+        if !self.values.may_say(topic, from, now) {
             return;
         }
-        let shape = match self.topics.get(&topic).map(|entry| &entry.role) {
+        let shape = match self.values.topics.get(&topic).map(|entry| &entry.role) {
             Some(Role::Theirs(reader)) => reader.shape.clone(),
             Some(Role::Ours(_)) | None => None,
         };
-        let fault = self.learn_layout(topic, meta_data, from, now).err();
-        if !self.is_learned(topic) {
+        let fault = self.values.learn_layout(topic, meta_data, from, now).err();
+        if !self.values.is_learned(topic) {
             self.discovery(now).answered(space, |other| other == topic);
             if let Some(why) = fault {
-                self.count(about, Reason::MetaData, 1, || why);
+                self.values.count(about, Reason::MetaData, 1, || why);
             }
             return;
         }
         let described = match Described::read(meta_data) {
             Ok(described) => described,
             Err(why) => {
-                self.count(about, (Reason::MetaData, "useless"), 1, || why);
+                self.values
+                    .count(about, (Reason::MetaData, "useless"), 1, || why);
                 return;
             }
         };
         self.discovery(now).answered(space, |other| other == topic);
         if let Some(described) = &described
             && shape.is_some()
-            && !self.may_be_renamed(topic, described, now)
+            && !self.values.may_be_renamed(topic, described, now)
         {
-            self.count(about, (Reason::MetaData, "too often"), 1, || {
-                "its writer says too often that it is something else".to_owned()
-            });
+            self.values
+                .count(about, (Reason::MetaData, "too often"), 1, || {
+                    "its writer says too often that it is something else".to_owned()
+                });
             return;
         }
-        match self.take_note(topic, described, now) {
+        match self.values.take_note(topic, described, now) {
             News::Same => {}
-            News::Full => self.count(about, (Reason::MetaData, "no room"), 1, || {
-                "there is no room for what more topics consist of".to_owned()
-            }),
+            News::Full => self
+                .values
+                .count(about, (Reason::MetaData, "no room"), 1, || {
+                    "there is no room for what more topics consist of".to_owned()
+                }),
             News::Other => {
-                let counters = self.topics.get_mut(&topic);
-                let counters = counters.map_or(&mut self.others, |entry| &mut entry.counters);
+                let counters = self.values.topics.get_mut(&topic);
+                let counters =
+                    counters.map_or(&mut self.values.others, |entry| &mut entry.counters);
                 counters.described += 1;
-                if !self.arrange(topic, now) && shape.is_some() {
-                    self.tell_unbound(topic);
+                if !self.values.arrange(topic, now) && shape.is_some() {
+                    self.values.tell_unbound(topic);
                 }
             }
         }
@@ -428,19 +389,97 @@ impl Router {
         let named = meta_data.name.and_then(split_name);
         let topic = named.map(|(topic, _)| topic);
         let topic = topic.filter(|topic| topic.space == space && topic.triple().2 == writer_id);
-        if let Some(topic) = topic.filter(|topic| self.is_home(*topic)) {
+        if let Some(topic) = topic.filter(|topic| self.values.is_home(*topic)) {
             let (_, namespace, _) = topic.triple();
-            self.drop_own(Some(namespace), from, now);
+            self.values.drop_own(Some(namespace), from, now);
             return None;
         }
         let bad = status.0 & STATUS_BAD != 0;
         match topic {
             Some(topic) if bad => self.unlearn(topic, from, now),
             None if bad => self.learn_of_none(writer_id, (space, from), now),
-            None => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
+            None => self
+                .values
+                .count(About::sender(from), Reason::NotInSpace, 1, String::new),
             Some(topic) => return Some(topic),
         }
         None
+    }
+
+    /// Handles the announcement that a Publisher does not have a DataSetWriter. Its topics are not
+    /// probed any more, except topics with values from another sender.
+    fn learn_of_none(&mut self, writer_id: u16, (space, from): (SpaceId, SocketAddr), now: Now) {
+        let timeout = self.values.mapping.pubsub().receive_timeout;
+        let probing = self.discovery.as_ref();
+        let probing = probing.and_then(|discovery| discovery.probing.get(&space));
+        let asked = probing.into_iter().flat_map(|probing| &probing.topics);
+        let (denied, doubtful): (Vec<TopicId>, Vec<TopicId>) = asked
+            .filter(|topic| topic.triple().2 == writer_id)
+            .partition(
+                |topic| match self.values.topics.get(topic).map(|of| &of.role) {
+                    Some(Role::Theirs(reader)) => reader.may_be(from, now.monotonic, timeout),
+                    Some(Role::Ours(_)) | None => true,
+                },
+            );
+        for topic in doubtful {
+            let about = About {
+                topic: Some(topic),
+                from: Some(from),
+            };
+            self.values.count(about, (Reason::MetaData, "sender"), 1, || {
+                "another program than the one that sends its values says that there is no such writer"
+                    .to_owned()
+            });
+        }
+        self.discovery(now)
+            .answered(space, |topic| denied.contains(&topic));
+    }
+
+    /// Counts an announcement or probe that could not be sent.
+    pub fn not_announced(&mut self, reason: Reason, detail: &str) {
+        let about = About {
+            topic: None,
+            from: None,
+        };
+        self.values
+            .count(about, (reason, "socket"), 1, || detail.to_owned());
+    }
+}
+
+impl Values {
+    /// Plans a probe for the metadata of a topic of another space.
+    pub(super) fn ask_what(&mut self, topic: TopicId) {
+        if self.is_learned(topic) {
+            self.inquiries.probe(topic);
+        }
+    }
+
+    /// Plans a probe for the fields of a topic if its messages cannot be read without them. The
+    /// rate of these probes is limited.
+    pub(super) fn ask_layout(&mut self, topic: TopicId, now: Now) {
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        let before = reader.asked_layout;
+        if before.is_none_or(|asked| now.monotonic >= asked + ASK_LAYOUT_AGAIN) {
+            reader.asked_layout = Some(now.monotonic);
+            self.inquiries.probe(topic);
+        }
+    }
+
+    /// Returns whether the local type of a topic may come from its writer, because the mapping does
+    /// not define it.
+    fn is_learned(&self, topic: TopicId) -> bool {
+        let own = self.settings.own;
+        let bound = self.mapping.variable(topic).is_some_and(|variable| {
+            let service = variable.service.as_ref();
+            variable.binding(own).is_some() || service.is_some_and(|service| service.space == own)
+        });
+        self.settings.local != Local::Fields && !bound
     }
 
     /// Returns whether the sender may announce the topic as its writer.
@@ -479,64 +518,29 @@ impl Router {
     ) -> Result<(), String> {
         let layout = Layout::read(meta_data, from)?;
         let until = (now.monotonic, self.mapping.pubsub().metadata_period);
-        let own = self.settings.own;
-        let discovery = self
-            .discovery
-            .get_or_insert_with(|| Box::new(Discovery::new(own, now.monotonic)));
         let rank = rank(&self.topics, &self.mapping, now.monotonic);
-        match discovery.layouts.learn(topic, layout, until, rank) {
+        match self.layouts.learn(topic, layout, until, rank) {
             News::Full => Err("there is no room for what the fields of more topics are".to_owned()),
             News::Same | News::Other => Ok(()),
         }
-    }
-
-    /// Handles the announcement that a Publisher does not have a DataSetWriter. Its topics are not
-    /// probed any more, except topics with values from another sender.
-    fn learn_of_none(&mut self, writer_id: u16, (space, from): (SpaceId, SocketAddr), now: Now) {
-        let timeout = self.mapping.pubsub().receive_timeout;
-        let probing = self.discovery.as_ref();
-        let probing = probing.and_then(|discovery| discovery.probing.get(&space));
-        let asked = probing.into_iter().flat_map(|probing| &probing.topics);
-        let (denied, doubtful): (Vec<TopicId>, Vec<TopicId>) = asked
-            .filter(|topic| topic.triple().2 == writer_id)
-            .partition(|topic| match self.topics.get(topic).map(|of| &of.role) {
-                Some(Role::Theirs(reader)) => reader.may_be(from, now.monotonic, timeout),
-                Some(Role::Ours(_)) | None => true,
-            });
-        for topic in doubtful {
-            let about = About {
-                topic: Some(topic),
-                from: Some(from),
-            };
-            self.count(about, (Reason::MetaData, "sender"), 1, || {
-                "another program than the one that sends its values says that there is no such writer"
-                    .to_owned()
-            });
-        }
-        self.discovery(now)
-            .answered(space, |topic| denied.contains(&topic));
     }
 
     /// Stores the description of a topic. An announcement without a ROS type removes the stored
     /// description.
     fn take_note(&mut self, topic: TopicId, described: Option<Described>, now: Now) -> News {
         let until = (now.monotonic, self.mapping.pubsub().metadata_period);
-        let Some(discovery) = &mut self.discovery else {
-            return News::Same;
-        };
         let Some(described) = described else {
-            discovery.learned.forget(topic);
+            self.learned.forget(topic);
             return News::Same;
         };
         let rank = rank(&self.topics, &self.mapping, now.monotonic);
-        discovery.learned.learn(topic, described, until, rank)
+        self.learned.learn(topic, described, until, rank)
     }
 
     /// Returns whether a topic with values may change to the description. The known description is
     /// always accepted.
     fn may_be_renamed(&mut self, topic: TopicId, described: &Described, now: Now) -> bool {
-        let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
-        let known = learned.and_then(|learned| learned.last(topic));
+        let known = self.learned.last(topic);
         if known.is_some_and(|known| **known == *described) {
             return true;
         }
@@ -563,9 +567,7 @@ impl Router {
         if self.arrange(topic, now) {
             return None;
         }
-        let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
-        let described = learned.and_then(|learned| learned.get(topic, now.monotonic));
-        let described = described.cloned();
+        let described = self.learned.get(topic, now.monotonic).cloned();
         let fits = described
             .as_ref()
             .is_none_or(|described| described.fits(&shape));
@@ -573,7 +575,7 @@ impl Router {
             return None;
         }
         if described.is_none() {
-            self.ask_what(topic, now);
+            self.ask_what(topic);
         }
         if !fits {
             self.count(About::topic(topic), (Reason::MetaData, "values"), 1, || {
@@ -585,15 +587,6 @@ impl Router {
             shape,
             described: described.filter(|_| fits),
         })
-    }
-
-    /// Counts an announcement or probe that could not be sent.
-    pub fn not_announced(&mut self, reason: Reason, detail: &str) {
-        let about = About {
-            topic: None,
-            from: None,
-        };
-        self.count(about, (reason, "socket"), 1, || detail.to_owned());
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use mappings::{Lasting, Overflow, SpaceId, TopicId};
 
-use super::{About, Router};
+use super::{About, Router, Values};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::gate::Gate;
@@ -17,6 +17,20 @@ use crate::topic::{Role, Topic};
 use crate::writer::Writer;
 
 impl Router {
+    /// Returns the time of the last message of each topic of another space that was received at
+    /// least once.
+    pub fn heard(&self) -> impl Iterator<Item = (TopicId, Instant)> {
+        self.values
+            .topics
+            .iter()
+            .filter_map(|(topic, entry)| match &entry.role {
+                Role::Theirs(reader) if reader.was_heard() => Some((*topic, reader.heard_at())),
+                Role::Theirs(_) | Role::Ours(_) => None,
+            })
+    }
+}
+
+impl Values {
     /// Returns the entry of a topic and creates it if necessary. Returns `None` for an unknown
     /// topic if the limit is reached.
     pub(super) fn entry(
@@ -74,21 +88,10 @@ impl Router {
             self.topics.insert(topic, entry);
             if from.is_some() {
                 self.schedule(topic);
-                self.meet(topic, now);
+                self.inquiries.meet(topic);
             }
         }
         self.topics.get_mut(&topic)
-    }
-
-    /// Returns the time of the last message of each topic of another space that was received at
-    /// least once.
-    pub fn heard(&self) -> impl Iterator<Item = (TopicId, Instant)> {
-        self.topics
-            .iter()
-            .filter_map(|(topic, entry)| match &entry.role {
-                Role::Theirs(reader) if reader.was_heard() => Some((*topic, reader.heard_at())),
-                Role::Theirs(_) | Role::Ours(_) => None,
-            })
     }
 
     fn take_place(&mut self, now: Now) -> bool {

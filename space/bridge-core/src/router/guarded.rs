@@ -39,7 +39,7 @@ impl Router {
 
     /// Applies the groups of the mapping.
     pub(super) fn renew_guard(&mut self) {
-        let groups = self.mapping.security();
+        let groups = self.values.mapping.security();
         match &mut self.guard {
             Some(guard) => {
                 if !guard.replace(groups) {
@@ -51,6 +51,7 @@ impl Router {
                 self.mark_guard();
             }
         }
+        self.values.overhead = self.guard.as_ref().map_or(0, |_| Guard::OVERHEAD);
     }
 
     /// Sets the random bytes of the guard, if they are known.
@@ -70,12 +71,16 @@ impl Router {
         now: Now,
     ) {
         // An own message that was received again. It is not opened, to save time.
-        if message.is_sealed() && self.settings.source.is_some() && self.is_source(from) {
+        if message.is_sealed()
+            && self.values.settings.source.is_some()
+            && self.values.is_source(from)
+        {
             let about = About::sender(from);
-            self.count(about, crate::Reason::Looped, 1, String::new);
+            self.values
+                .count(about, crate::Reason::Looped, 1, String::new);
             return;
         }
-        let mut scratch = self.buffer();
+        let mut scratch = self.values.buffer();
         let opened = match &mut self.guard {
             Some(guard) => guard.open(message, now.monotonic, &mut scratch),
             None => Ok(None),
@@ -93,16 +98,18 @@ impl Router {
                 reason,
                 case,
                 detail,
-            }) => self.count(About::sender(from), (reason, case), 1, || detail),
+            }) => self
+                .values
+                .count(About::sender(from), (reason, case), 1, || detail),
         }
-        self.recycle(scratch);
+        self.values.recycle(scratch);
         self.want_keys(now);
     }
 
     pub(super) fn want_keys(&mut self, now: Now) {
         let guard = self.guard.as_mut();
         if let Some(group) = guard.and_then(|guard| guard.wanted(now.monotonic)) {
-            self.tell(Output::KeysWanted { group });
+            self.values.tell(Output::KeysWanted { group });
         }
     }
 
@@ -113,12 +120,17 @@ impl Router {
         let unsaid = self.in_clear && secured;
         if unsaid {
             let cause = (crate::Reason::Unsecured, "announcement");
-            self.count(About::sender(from), cause, 1, || match namespace {
-                Some(namespace) => {
-                    format!("it says in clear what is in namespace {namespace}, which is secured")
-                }
-                None => "it says in clear what there is, and there are secured groups".to_owned(),
-            });
+            self.values
+                .count(About::sender(from), cause, 1, || match namespace {
+                    Some(namespace) => {
+                        format!(
+                            "it says in clear what is in namespace {namespace}, which is secured"
+                        )
+                    }
+                    None => {
+                        "it says in clear what there is, and there are secured groups".to_owned()
+                    }
+                });
         }
         unsaid
     }
@@ -137,10 +149,10 @@ impl Router {
             Output::Discovery { bytes } | Output::Heartbeat { bytes } => (bytes, None),
             _ => return Some(output),
         };
-        let mut sealed = self.spare.pop().unwrap_or_default();
+        let mut sealed = self.values.spare.pop().unwrap_or_default();
         match guard.seal(bytes, &mut sealed) {
             Ok(false) => {
-                self.recycle(sealed);
+                self.values.recycle(sealed);
                 Some(output)
             }
             Ok(true) => {
@@ -167,7 +179,7 @@ impl Router {
                     Output::Heartbeat { bytes } => (bytes, Output::Heartbeat { bytes: sealed }),
                     other => (sealed, other),
                 };
-                self.recycle(clear);
+                self.values.recycle(clear);
                 Some(output)
             }
             Err(Unopened {
@@ -175,9 +187,9 @@ impl Router {
                 case,
                 detail,
             }) => {
-                self.recycle(sealed);
+                self.values.recycle(sealed);
                 let about = About { topic, from: None };
-                self.count(about, (reason, case), 1, || detail);
+                self.values.count(about, (reason, case), 1, || detail);
                 None
             }
         }

@@ -6,14 +6,14 @@ use mappings::TopicId;
 use uadp::Fields;
 
 use super::receive::Sample;
-use super::{About, Router};
+use super::{About, Values};
 use crate::counters::Reason;
 use crate::output::Kept;
 use crate::reader::Held;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
-impl Router {
+impl Values {
     /// Stores a sample until its local type is known, in place of the previous sample.
     pub(super) fn hold(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
         let held = Box::new(Held {

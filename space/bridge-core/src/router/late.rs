@@ -5,7 +5,7 @@ use std::time::Duration;
 use mappings::{Lasting, TopicId};
 use uadp::{NetworkHeader, Timestamp};
 
-use super::Router;
+use super::{Router, Values};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::place::Place;
@@ -22,15 +22,15 @@ impl Router {
     /// message after its sender has given it up. Messages that act but carry no time are dropped
     /// too.
     pub const fn set_relay(&mut self, relay: Option<Relay>) {
-        self.relay = relay;
+        self.values.relay = relay;
     }
 
     /// Returns the time after which a message of the topic must not be delivered any more; `None`
     /// without a broker.
     #[must_use]
     pub fn expiry(&self, topic: TopicId) -> Option<Duration> {
-        let relay = self.relay?;
-        let confirming = self.topics.get(&topic)?.confirming.as_deref();
+        let relay = self.values.relay?;
+        let confirming = self.values.topics.get(&topic)?.confirming.as_deref();
         let within = confirming.map_or(relay.within, Confirming::within);
         Some(within.min(relay.within))
     }
@@ -38,13 +38,19 @@ impl Router {
     /// Returns whether a newer value of the topic replaces an older one, as for a state.
     #[must_use]
     pub fn is_state(&self, topic: TopicId) -> bool {
-        let entry = self.topics.get(&topic);
+        let entry = self.values.topics.get(&topic);
         entry.is_some_and(|entry| entry.lasting == Lasting::State)
     }
 
     /// Returns whether bridges confirm the values of the topic.
     #[must_use]
     pub fn is_command(&self, topic: TopicId) -> bool {
+        self.values.is_command(topic)
+    }
+}
+
+impl Values {
+    fn is_command(&self, topic: TopicId) -> bool {
         let entry = self.topics.get(&topic);
         entry.is_some_and(|entry| entry.confirming.is_some())
     }

@@ -9,7 +9,7 @@ use mappings::TopicId;
 use uadp::discovery::{List, Probe};
 use uadp::{PublisherId, SecurityHeader};
 
-use super::{About, Router};
+use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::output::Output;
@@ -52,32 +52,28 @@ impl Router {
     /// namespaces that are not owned any more, and received topics in newly owned namespaces, are
     /// removed.
     pub fn set_owned(&mut self, owned: Owned, now: Now) {
-        if owned == self.owned {
+        if owned == self.values.owned {
             return;
         }
-        self.owned = owned;
+        self.values.owned = owned;
         let moved: Vec<TopicId> = self
+            .values
             .topics
             .iter()
-            .filter(|(topic, entry)| matches!(entry.role, Role::Ours(_)) != self.is_home(**topic))
+            .filter(|(topic, entry)| {
+                matches!(entry.role, Role::Ours(_)) != self.values.is_home(**topic)
+            })
             .map(|(topic, _)| *topic)
             .collect();
         for topic in moved {
             self.drop_topic(topic);
         }
         self.sort_calls(now);
-        if let Some(claims) = &mut self.claims {
-            claims.of.retain(|namespace, _| self.owned.has(*namespace));
+        if let Some(claims) = &mut self.values.claims {
+            claims
+                .of
+                .retain(|namespace, _| self.values.owned.has(*namespace));
         }
-    }
-
-    /// Returns whether only this program writes the topic.
-    pub(super) fn is_home(&self, topic: TopicId) -> bool {
-        self.owned.is_home(self.settings.own, topic)
-    }
-
-    pub(super) fn may_cross(&self, heard_on: Side, what: What, topic: TopicId) -> bool {
-        may_cross(self.is_home(topic), heard_on, what)
     }
 
     /// Probes for other writers of the own namespaces, and waits for a moment before anything is
@@ -85,30 +81,108 @@ impl Router {
     /// program has been silent for `receive_timeout`. Has no effect for a program that does not
     /// share its space.
     pub fn claim(&mut self, now: Now) {
-        let Owned::Only(namespaces) = &self.owned else {
+        let Owned::Only(namespaces) = &self.values.owned else {
             return;
         };
         let until = now.monotonic + LISTEN;
-        let claims = self.claims.get_or_insert_default();
+        let claims = self.values.claims.get_or_insert_default();
         for namespace in namespaces {
             claims
                 .of
                 .entry(*namespace)
                 .or_insert(Claim::Listening { until });
         }
-        let mut bytes = self.buffer();
+        let mut bytes = self.values.buffer();
         let probe = Probe::PubSubConnections {
             transport_profile_uris: List::null(),
             include_writer_groups: false,
             include_data_set_writers: false,
         };
-        let publisher = Some(PublisherId::UInt16(self.settings.own.into()));
+        let publisher = Some(PublisherId::UInt16(self.values.settings.own.into()));
         if probe
             .encode(publisher, SecurityHeader::NONE, &mut bytes)
             .is_ok()
         {
-            self.tell(Output::Discovery { bytes });
+            self.values.tell(Output::Discovery { bytes });
         }
+    }
+
+    /// Starts to send in free namespaces.
+    pub(super) fn look_at_claims(&mut self, now: Now) {
+        let (_, _, silence) = self.values.periods();
+        let Some(claims) = &mut self.values.claims else {
+            return;
+        };
+        let over = |claim: &Claim| claim.ends(silence) <= now.monotonic;
+        let free = claims.of.iter().filter(|(_, claim)| over(claim));
+        let free: Vec<(u16, Claim)> = free.map(|(of, claim)| (*of, *claim)).collect();
+        claims.of.retain(|_, claim| !over(claim));
+        if claims.of.is_empty() {
+            self.values.claims = None;
+        }
+        for (namespace, claim) in free {
+            let again = matches!(claim, Claim::Taken { .. });
+            if again {
+                self.values.tell(Output::Taken {
+                    namespace,
+                    by: None,
+                });
+            }
+            self.send_again(namespace, again, now);
+        }
+    }
+
+    /// Sends the waiting items of a namespace, and announces its topics and calls. If items were
+    /// dropped, the kept values are repeated.
+    fn send_again(&mut self, namespace: u16, dropped: bool, now: Now) {
+        let ours = |(topic, entry): (&TopicId, &Topic)| {
+            let (_, of, _) = topic.triple();
+            (of == namespace && matches!(entry.role, Role::Ours(_))).then_some(*topic)
+        };
+        let topics: Vec<TopicId> = self.values.topics.iter().filter_map(ours).collect();
+        for topic in topics {
+            let Some(entry) = self.values.topics.get_mut(&topic) else {
+                continue;
+            };
+            if let Role::Ours(writer) = &mut entry.role
+                && dropped
+            {
+                writer.begin_round(now.monotonic);
+            }
+            entry.announce_at = entry.announce_at.map(|_| now.monotonic);
+            if !entry.ready && entry.has_more() {
+                entry.ready = true;
+                self.values.ready.push_back(topic);
+            }
+            self.announce_again(topic, now);
+            self.values.schedule(topic);
+        }
+        self.announce_calls(now);
+    }
+
+    /// Removes a topic and keeps its counters in total.
+    fn drop_topic(&mut self, topic: TopicId) {
+        let Some(entry) = self.values.topics.remove(&topic) else {
+            return;
+        };
+        self.values.others.absorb(&entry.counters);
+        if let Role::Theirs(reader) = entry.role
+            && let Some(base) = reader.base
+        {
+            self.values.base_bytes = self.values.base_bytes.saturating_sub(base.weight());
+        }
+        self.forget_described(topic);
+    }
+}
+
+impl Values {
+    /// Returns whether only this program writes the topic.
+    pub(super) fn is_home(&self, topic: TopicId) -> bool {
+        self.owned.is_home(self.settings.own, topic)
+    }
+
+    pub(super) fn may_cross(&self, heard_on: Side, what: What, topic: TopicId) -> bool {
+        may_cross(self.is_home(topic), heard_on, what)
     }
 
     /// Records a message of another program in an own namespace.
@@ -168,73 +242,6 @@ impl Router {
                 String::new,
             );
         }
-    }
-
-    /// Starts to send in free namespaces.
-    pub(super) fn look_at_claims(&mut self, now: Now) {
-        let (_, _, silence) = self.periods();
-        let Some(claims) = &mut self.claims else {
-            return;
-        };
-        let over = |claim: &Claim| claim.ends(silence) <= now.monotonic;
-        let free = claims.of.iter().filter(|(_, claim)| over(claim));
-        let free: Vec<(u16, Claim)> = free.map(|(of, claim)| (*of, *claim)).collect();
-        claims.of.retain(|_, claim| !over(claim));
-        if claims.of.is_empty() {
-            self.claims = None;
-        }
-        for (namespace, claim) in free {
-            let again = matches!(claim, Claim::Taken { .. });
-            if again {
-                self.tell(Output::Taken {
-                    namespace,
-                    by: None,
-                });
-            }
-            self.send_again(namespace, again, now);
-        }
-    }
-
-    /// Sends the waiting items of a namespace, and announces its topics and calls. If items were
-    /// dropped, the kept values are repeated.
-    fn send_again(&mut self, namespace: u16, dropped: bool, now: Now) {
-        let ours = |(topic, entry): (&TopicId, &Topic)| {
-            let (_, of, _) = topic.triple();
-            (of == namespace && matches!(entry.role, Role::Ours(_))).then_some(*topic)
-        };
-        let topics: Vec<TopicId> = self.topics.iter().filter_map(ours).collect();
-        for topic in topics {
-            let Some(entry) = self.topics.get_mut(&topic) else {
-                continue;
-            };
-            if let Role::Ours(writer) = &mut entry.role
-                && dropped
-            {
-                writer.begin_round(now.monotonic);
-            }
-            entry.announce_at = entry.announce_at.map(|_| now.monotonic);
-            if !entry.ready && entry.has_more() {
-                entry.ready = true;
-                self.ready.push_back(topic);
-            }
-            self.announce_again(topic, now);
-            self.schedule(topic);
-        }
-        self.announce_calls(now);
-    }
-
-    /// Removes a topic and keeps its counters in total.
-    fn drop_topic(&mut self, topic: TopicId) {
-        let Some(entry) = self.topics.remove(&topic) else {
-            return;
-        };
-        self.others.absorb(&entry.counters);
-        if let Role::Theirs(reader) = entry.role
-            && let Some(base) = reader.base
-        {
-            self.base_bytes = self.base_bytes.saturating_sub(base.weight());
-        }
-        self.forget_described(topic);
     }
 }
 

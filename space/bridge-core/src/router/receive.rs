@@ -11,7 +11,7 @@ use uadp::{
 
 use super::content::Quality;
 use super::redundant::precedes;
-use super::{About, Crossing, Router, late};
+use super::{About, Crossing, Router, Values, late};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::fields;
@@ -30,8 +30,9 @@ impl Router {
         match NetworkMessage::decode(datagram) {
             Ok(message) if self.guard.is_some() => self.handle_guarded(&message, from, now),
             Ok(message) => self.handle_network_message(&message, from, now),
-            Err(error) => self.drop_undecoded(None, from, &error),
+            Err(error) => self.values.drop_undecoded(None, from, &error),
         }
+        self.inquire(now);
     }
 
     pub(super) fn handle_network_message(
@@ -42,15 +43,18 @@ impl Router {
     ) {
         let header = message.header();
         let late = self
+            .values
             .relay
             .and_then(|relay| relay.judge_message(sent(&header), now.utc));
         if let Some((case, detail)) = late {
-            return self.count(About::sender(from), late::cause(case), 1, || detail);
+            return self
+                .values
+                .count(About::sender(from), late::cause(case), 1, || detail);
         }
         if self.is_for_all(message, from, now) || self.is_heartbeat(message, from, now) {
             return;
         }
-        let Some(space) = self.space_of(&header, from) else {
+        let Some(space) = self.values.space_of(&header, from) else {
             return;
         };
         if message.message_type() != NetworkMessageType::DataSet {
@@ -65,7 +69,7 @@ impl Router {
             return;
         }
         let namespace = header.group.and_then(|group| group.writer_group_id);
-        if self.is_ours(space, namespace) {
+        if self.values.is_ours(space, namespace) {
             // A large request for an own call has the PublisherId of the own space, as a small
             // request has.
             let request = message.is_chunk() && !message.is_sealed() && self.calls.is_some();
@@ -75,19 +79,20 @@ impl Router {
                 }
                 (true, Some(_)) => {
                     let cause = (Reason::CallRefused, "chunk");
-                    self.count(About::sender(from), cause, 1, || {
+                    self.values.count(About::sender(from), cause, 1, || {
                         format!(
                             "{from} is another host, and no call of the namespace is open to others"
                         )
                     });
                 }
                 _ if self.follow_peer(message, namespace, from, now) => {}
-                _ => self.drop_own(namespace, from, now),
+                _ => self.values.drop_own(namespace, from, now),
             }
             return;
         }
         let Some(namespace) = namespace else {
-            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            self.values
+                .count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
         // A chunk without a payload header may belong to a response, and the responding program
@@ -109,15 +114,31 @@ impl Router {
                     let writer_id = message.writer_id.unwrap_or_default();
                     let id = TopicId::new(u16::from(space.get()), namespace, writer_id);
                     match id {
-                        Some(topic) => self.handle_message(topic, &message, (from, sent), now),
-                        None => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
+                        Some(topic) => {
+                            self.values
+                                .handle_message(topic, &message, (from, sent), now)
+                        }
+                        None => self.values.count(
+                            About::sender(from),
+                            Reason::NotInSpace,
+                            1,
+                            String::new,
+                        ),
                     }
                 }
-                Err(error) => self.drop_undecoded(None, from, &error),
+                Err(error) => self.values.drop_undecoded(None, from, &error),
             }
         }
     }
 
+    /// Sets the source address of own datagrams, for example after a change of the network
+    /// interface.
+    pub fn set_source(&mut self, source: SocketAddr) {
+        self.values.settings.source = Some(source);
+    }
+}
+
+impl Values {
     /// Returns the space of a NetworkMessage, or counts the reason why it cannot be read.
     fn space_of(&mut self, header: &NetworkHeader<'_>, from: SocketAddr) -> Option<SpaceId> {
         let (number, exact) = number_of(header.publisher_id);
@@ -135,12 +156,6 @@ impl Router {
             )
         });
         None
-    }
-
-    /// Sets the source address of own datagrams, for example after a change of the network
-    /// interface.
-    pub fn set_source(&mut self, source: SocketAddr) {
-        self.settings.source = Some(source);
     }
 
     /// Returns whether only this program writes messages of the group. A message without a group
@@ -288,7 +303,7 @@ impl Router {
             self.tell_returned(topic);
         }
         if changed {
-            self.ask_what(topic, now);
+            self.ask_what(topic);
         }
         self.retire(topic, now);
         let entry = self.topics.get(&topic);

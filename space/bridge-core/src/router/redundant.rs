@@ -12,7 +12,7 @@ use uadp::discovery::{Included, Subject};
 use uadp::{MessageKind, NetworkMessage, NetworkMessageType, Timestamp};
 
 pub(super) use self::senders::ActiveSender;
-use super::{About, Router};
+use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
@@ -70,7 +70,7 @@ impl Router {
     pub fn set_redundancy(&mut self, rank: Rank, now: Now) {
         let [.., a, b, c, d] = self.instance;
         let instance = u32::from_le_bytes([a, b, c, d]);
-        self.redundant = Some(Box::new(Redundant {
+        self.values.redundant = Some(Box::new(Redundant {
             state: Redundancy::new(rank, instance, now),
             held: BTreeMap::new(),
             losses: BTreeMap::new(),
@@ -85,13 +85,16 @@ impl Router {
     /// Returns the state of the redundancy; `None` for a program without redundancy.
     #[must_use]
     pub fn redundancy(&self) -> Option<&Redundancy> {
-        self.redundant.as_ref().map(|redundant| &redundant.state)
+        self.values
+            .redundant
+            .as_ref()
+            .map(|redundant| &redundant.state)
     }
 
     /// Returns the number of samples that were muted.
     #[must_use]
     pub fn muted_samples(&self) -> Option<MutedSamples> {
-        let redundant = self.redundant.as_ref()?;
+        let redundant = self.values.redundant.as_ref()?;
         Some(MutedSamples {
             sent: redundant.muted_sent,
             delivered: redundant.muted_delivered,
@@ -100,7 +103,7 @@ impl Router {
 
     /// Sets whether the local side is within reach.
     pub fn set_fit(&mut self, is_fit: bool) {
-        if let Some(redundant) = &mut self.redundant {
+        if let Some(redundant) = &mut self.values.redundant {
             redundant.state.set_fit(is_fit);
         }
     }
@@ -110,7 +113,11 @@ impl Router {
     /// # Errors
     /// This program is not active, or there is no standby.
     pub fn switch_over(&mut self, now: Now) -> Result<(), SwitchRefusal> {
-        let redundant = self.redundant.as_mut().ok_or(SwitchRefusal::NotActive)?;
+        let redundant = self
+            .values
+            .redundant
+            .as_mut()
+            .ok_or(SwitchRefusal::NotActive)?;
         // The lease may have ended.
         if let Some(change) = redundant.state.check(now) {
             self.change_role(change, now);
@@ -124,7 +131,7 @@ impl Router {
 
     /// Records whether the network took the last heartbeat.
     pub fn heartbeat_sent(&mut self, is_sent: bool, now: Now) {
-        let Some(redundant) = &mut self.redundant else {
+        let Some(redundant) = &mut self.values.redundant else {
             return;
         };
         let change = match is_sent {
@@ -138,7 +145,7 @@ impl Router {
 
     /// Records that there were no keys for a heartbeat.
     pub(super) fn heartbeat_not_sealed(&mut self, now: Now) {
-        let redundant = self.redundant.as_mut();
+        let redundant = self.values.redundant.as_mut();
         let change = redundant.and_then(|redundant| redundant.state.not_sealed(now));
         if let Some(change) = change {
             self.change_role(change, now);
@@ -146,14 +153,15 @@ impl Router {
     }
 
     pub(super) fn redundancy_due(&self) -> Option<Instant> {
-        self.redundant
+        self.values
+            .redundant
             .as_ref()
             .map(|redundant| redundant.state.due())
     }
 
     /// Mutes this program if its lease has ended. Called before each output.
     pub(super) fn check_lease(&mut self, now: Now) {
-        let redundant = self.redundant.as_mut();
+        let redundant = self.values.redundant.as_mut();
         if let Some(change) = redundant.and_then(|redundant| redundant.state.check(now)) {
             self.change_role(change, now);
         }
@@ -162,7 +170,7 @@ impl Router {
     /// Sends the heartbeat if it is due, and takes over if the active bridge is lost.
     pub(super) fn look_at_redundancy(&mut self, now: Now) {
         self.check_lease(now);
-        let Some(redundant) = &mut self.redundant else {
+        let Some(redundant) = &mut self.values.redundant else {
             return;
         };
         let (heartbeat, change) = redundant.state.poll(now);
@@ -176,18 +184,20 @@ impl Router {
 
     /// Queues the heartbeat before all other outputs.
     fn send_heartbeat(&mut self, now: Now) {
-        let mut bytes = self.buffer();
-        let own = self.settings.own;
-        let Some(redundant) = &self.redundant else {
+        let mut bytes = self.values.buffer();
+        let own = self.values.settings.own;
+        let Some(redundant) = &self.values.redundant else {
             return;
         };
         let heartbeat = redundant.state.heartbeat();
         match heartbeat.encode(own, now.utc, &mut bytes) {
-            Ok(()) => self.told.push_front(Output::Heartbeat { bytes }),
-            Err(_) => self.recycle(bytes),
+            Ok(()) => self.values.told.push_front(Output::Heartbeat { bytes }),
+            Err(_) => self.values.recycle(bytes),
         }
     }
+}
 
+impl Values {
     /// Returns whether nothing is sent to the group.
     pub(super) fn is_muted(&self) -> bool {
         let redundant = self.redundant.as_ref();
@@ -199,7 +209,9 @@ impl Router {
         let redundant = self.redundant.as_ref();
         redundant.is_some_and(|redundant| redundant.state.mutes_local())
     }
+}
 
+impl Router {
     /// Returns whether an output is dropped, because another bridge sends it. Samples are muted
     /// where they are polled.
     #[expect(
@@ -216,7 +228,7 @@ impl Router {
             } => self.drop_held_states(*topic, None),
             _ => {}
         }
-        if !self.is_muted() {
+        if !self.values.is_muted() {
             return false;
         }
         match output {
@@ -231,7 +243,7 @@ impl Router {
     /// Takes back the buffer of a muted output.
     pub(super) fn drop_muted(&mut self, output: Output) {
         if let Output::Action { bytes, .. } | Output::Discovery { bytes } = output {
-            self.recycle(bytes);
+            self.values.recycle(bytes);
         }
     }
 
@@ -245,12 +257,12 @@ impl Router {
         let Some((space, heartbeat)) = Heartbeat::decode(message) else {
             return false;
         };
-        if space != self.settings.own {
+        if space != self.values.settings.own {
             self.meet_redundant(space, heartbeat, from, now);
             return true;
         }
-        let Some(redundant) = &mut self.redundant else {
-            self.drop_own(None, from, now);
+        let Some(redundant) = &mut self.values.redundant else {
+            self.values.drop_own(None, from, now);
             return true;
         };
         let change = redundant.state.hear(heartbeat, from, now);
@@ -272,7 +284,7 @@ impl Router {
         from: SocketAddr,
         now: Now,
     ) -> bool {
-        let Some(redundant) = &self.redundant else {
+        let Some(redundant) = &self.values.redundant else {
             return false;
         };
         if !redundant.state.is_peer(from) {
@@ -286,7 +298,7 @@ impl Router {
                 return true;
             }
             let cause = (Reason::Takeover, "rival");
-            self.count(About::sender(from), cause, 1, || {
+            self.values.count(About::sender(from), cause, 1, || {
                 format!("{from} sent a value while this bridge was active: it may be doubled")
             });
             return true;
@@ -294,7 +306,7 @@ impl Router {
         let Some(namespace) = namespace else {
             return true;
         };
-        let space = u16::from(self.settings.own.get());
+        let space = u16::from(self.values.settings.own.get());
         if message.is_chunk() {
             let writer = message.writer_ids().and_then(|mut ids| ids.next());
             let topic = writer.and_then(|writer| TopicId::new(space, namespace, writer));
@@ -335,7 +347,7 @@ impl Router {
         if let Some(Topic {
             role: Role::Ours(writer),
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.values.topics.get_mut(&topic)
         {
             writer.follow(next, stamp);
         }
@@ -348,11 +360,12 @@ impl Router {
             role: Role::Ours(writer),
             lasting,
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.values.topics.get_mut(&topic)
         else {
             return;
         };
         let Some(redundant) = self
+            .values
             .redundant
             .as_mut()
             .filter(|_| *lasting != Lasting::Event)
@@ -373,7 +386,9 @@ impl Router {
         followed.fields.clear();
         followed.fields.extend_from_slice(fields);
     }
+}
 
+impl Values {
     /// Takes the stamp of the active bridge for a sample of this muted bridge, if the message of
     /// the active bridge was received first.
     pub(super) fn adopt_followed(&mut self, topic: TopicId) {
@@ -473,10 +488,12 @@ impl Router {
             redundant.losses.insert(held.1.topic, held);
         }
     }
+}
 
+impl Router {
     /// Drops the held states of a topic that are no current values any more.
     fn drop_held_states(&mut self, topic: TopicId, instance: Option<Timestamp>) {
-        let Some(redundant) = &mut self.redundant else {
+        let Some(redundant) = &mut self.values.redundant else {
             return;
         };
         match (instance, redundant.held.get_mut(&topic)) {
@@ -487,12 +504,16 @@ impl Router {
             (_, None) => {}
         }
     }
+}
 
+impl Values {
     /// Returns the time of the last takeover, as long as this program is active.
     pub(super) fn took_over(&self) -> Option<Instant> {
         self.redundant.as_ref()?.took_over
     }
+}
 
+impl Router {
     fn change_role(&mut self, change: RoleChange, now: Now) {
         match change {
             RoleChange::TookOver { gap, .. } => self.unmute(gap, now),
@@ -502,30 +523,32 @@ impl Router {
             | RoleChange::Rival { .. }
             | RoleChange::SameRank { .. } => {}
         }
-        self.tell(Output::Role(change));
+        self.values.tell(Output::Role(change));
     }
 
     /// Empties all queues.
     fn mute_all(&mut self, now: Now) {
-        if let Some(redundant) = &mut self.redundant {
+        if let Some(redundant) = &mut self.values.redundant {
             redundant.followed.clear();
             redundant.unsure.clear();
             redundant.took_over = None;
         }
-        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        let topics: Vec<TopicId> = self.values.topics.keys().copied().collect();
         for topic in topics {
-            self.mute_topic(topic, now);
+            self.values.mute_topic(topic, now);
         }
-        self.paced.clear();
+        self.values.paced.clear();
         // A heartbeat that was made before is outdated.
-        self.told.retain(|told| {
+        self.values.told.retain(|told| {
             !matches!(
                 told,
                 Output::CommanderLost { .. } | Output::Heartbeat { .. }
             )
         });
     }
+}
 
+impl Values {
     /// Empties the queue of a topic if it is muted. Returns false if it is not muted.
     pub(super) fn mute_topic(&mut self, topic: TopicId, now: Now) -> bool {
         let is_muted = match self.is_home(topic) {
@@ -551,15 +574,17 @@ impl Router {
             entry.ready = false;
         }
     }
+}
 
+impl Router {
     /// Continues where the former active bridge ended. `gap` is the time since its last heartbeat.
     fn unmute(&mut self, gap: Option<Duration>, now: Now) {
         // The former active bridge may have sent or published what waits since the last output.
-        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        let topics: Vec<TopicId> = self.values.topics.keys().copied().collect();
         for topic in &topics {
-            self.empty_topic(*topic, now);
+            self.values.empty_topic(*topic, now);
         }
-        let Some(redundant) = &mut self.redundant else {
+        let Some(redundant) = &mut self.values.redundant else {
             return;
         };
         redundant.took_over = Some(now.monotonic);
@@ -572,7 +597,8 @@ impl Router {
         let is_unsure = |at: Instant| unsure_since.is_none_or(|since| at >= since);
         for (topic, count) in unsure {
             let cause = (Reason::Takeover, "gap");
-            self.count_only(About::topic(topic), cause, count, String::new);
+            self.values
+                .count_only(About::topic(topic), cause, count, String::new);
         }
         for topic in topics {
             self.continue_own(topic, now);
@@ -583,15 +609,15 @@ impl Router {
                     // The former active bridge has published it: it is for late joiners only.
                     delivery.kept = Kept::Again;
                 }
-                self.push(topic, Item::Delivery(delivery));
+                self.values.push(topic, Item::Delivery(delivery));
             }
         }
         for (topic, (at, delivery)) in losses {
             if is_unsure(at) {
-                self.tell(Output::CommanderLost { topic });
-                self.push(topic, Item::Delivery(delivery));
+                self.values.tell(Output::CommanderLost { topic });
+                self.values.push(topic, Item::Delivery(delivery));
             } else {
-                self.recycle(delivery.payload);
+                self.values.recycle(delivery.payload);
             }
         }
         self.introduce_again(now);
@@ -607,7 +633,7 @@ impl Router {
             announce_at,
             ready,
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.values.topics.get_mut(&topic)
         else {
             return;
         };
@@ -625,14 +651,15 @@ impl Router {
         let repeats = writer.repeats();
         if repeats && !*ready {
             *ready = true;
-            self.ready.push_back(topic);
+            self.values.ready.push_back(topic);
         }
         if let Some((outdated, _)) = outdated {
-            self.recycle(outdated.bytes);
+            self.values.recycle(outdated.bytes);
             let cause = (Reason::Takeover, "gap");
-            self.count_only(About::topic(topic), cause, 1, String::new);
+            self.values
+                .count_only(About::topic(topic), cause, 1, String::new);
         }
-        self.schedule(topic);
+        self.values.schedule(topic);
     }
 
     /// Announces this program, so that its confirmations count.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use mappings::{Lasting, Mapping, Overflow, PubSub, TopicId};
 use messages::Wire;
 
-use super::{About, Router};
+use super::{About, Router, Values};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::gate::Gate;
@@ -18,7 +18,7 @@ impl Router {
     /// Returns the current mapping.
     #[must_use]
     pub const fn mapping(&self) -> &Arc<Mapping> {
-        &self.mapping
+        &self.values.mapping
     }
 
     /// Replaces the mapping. A topic with the same variable continues unchanged. If its queue or
@@ -28,15 +28,15 @@ impl Router {
     /// The port handles changed bindings: it calls [`unbind`](Self::unbind) for removed bindings
     /// and [`bind`](Self::bind) for new bindings.
     pub fn replace_mapping(&mut self, mapping: Arc<Mapping>, now: Now) {
-        let before = std::mem::replace(&mut self.mapping, mapping);
+        let before = std::mem::replace(&mut self.values.mapping, mapping);
         self.renew_chunks(before.pubsub());
         self.renew_guard();
-        let receive_timeout = self.mapping.pubsub().receive_timeout;
+        let receive_timeout = self.values.mapping.pubsub().receive_timeout;
         if let Some(calls) = &mut self.calls {
             calls.set_receive_timeout(receive_timeout);
         }
-        let renamed = before.namespaces() != self.mapping.namespaces();
-        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        let renamed = before.namespaces() != self.values.mapping.namespaces();
+        let topics: Vec<TopicId> = self.values.topics.keys().copied().collect();
         for topic in topics {
             let rules = |mapping: &Mapping| {
                 let variable = mapping.variable(topic);
@@ -47,15 +47,15 @@ impl Router {
                     })
                     .unwrap_or_default()
             };
-            let (was, is) = (rules(&before), rules(&self.mapping));
+            let (was, is) = (rules(&before), rules(&self.values.mapping));
             if was.0 != is.0 {
-                self.requeue(topic, is.0);
+                self.values.requeue(topic, is.0);
             }
             if was.1 != is.1 {
-                self.regate(topic, now);
+                self.values.regate(topic, now);
             }
-            let (was, is) = (before.variable(topic), self.mapping.variable(topic));
-            if let Some(entry) = self.topics.get_mut(&topic)
+            let (was, is) = (before.variable(topic), self.values.mapping.variable(topic));
+            if let Some(entry) = self.values.topics.get_mut(&topic)
                 && was != is
             {
                 entry.takes = Takes::of(is);
@@ -68,18 +68,19 @@ impl Router {
             }
             let reacts = is.is_some_and(|v| v.service.is_some());
             if reacts || was.map(|v| &v.loss) != is.map(|v| &v.loss) {
-                self.react_again(topic);
+                self.values.react_again(topic);
             }
-            let (was, is) = (before.variable(topic), self.mapping.variable(topic));
+            let (was, is) = (before.variable(topic), self.values.mapping.variable(topic));
             let meant = was.map(|v| &v.meaning) != is.map(|v| &v.meaning);
             // For this kind of local side only the mapping describes the values.
-            let typed = self.settings.local == Local::Fields && was != is;
+            let typed = self.values.settings.local == Local::Fields && was != is;
             if renamed || meant || typed {
                 self.describe_again(topic, now);
             }
             // The new mapping may have shorter periods.
-            self.schedule(topic);
+            self.values.schedule(topic);
         }
+        self.inquire(now);
     }
 
     /// Removes the binding of a topic that the local side does not have any more, or before it is
@@ -88,8 +89,9 @@ impl Router {
     /// requests a local type again. The counters are kept.
     pub fn unbind(&mut self, topic: TopicId, now: Now) {
         // The sample that waits for its time is the last sample.
-        self.regate(topic, now);
-        let Some(entry) = self.topics.get_mut(&topic) else {
+        self.values.regate(topic, now);
+        self.inquire(now);
+        let Some(entry) = self.values.topics.get_mut(&topic) else {
             return;
         };
         entry.plan = None;
@@ -102,17 +104,55 @@ impl Router {
             Role::Ours(writer) => {
                 writer.keep_nothing();
                 writer.set_live(false);
-                self.settle_arrival(topic);
+                self.values.settle_arrival(topic);
             }
             Role::Theirs(reader) => {
                 reader.held = None;
                 reader.shape = None;
                 reader.forget_all();
-                self.drop_deliveries(topic, "the mapping ties it to something else now");
+                self.values
+                    .drop_deliveries(topic, "the mapping ties it to something else now");
             }
         }
     }
 
+    /// Updates the description of a topic of the own space after a change of the mapping.
+    fn describe_again(&mut self, topic: TopicId, now: Now) {
+        if !self.values.is_home(topic) {
+            return;
+        }
+        let bound = self
+            .values
+            .topics
+            .get(&topic)
+            .and_then(|entry| entry.bound.clone());
+        if let Some((message_type, selection)) = bound.as_deref() {
+            self.describe(topic, Some((message_type, selection)), now);
+        } else if self.values.settings.local == Local::Fields {
+            self.describe(topic, None, now);
+        }
+    }
+
+    /// Applies changed limits for the reassembly of chunks. If they differ, incomplete messages are
+    /// given up.
+    fn renew_chunks(&mut self, before: &PubSub) {
+        let limits = |pubsub: &PubSub| (pubsub.max_message, pubsub.receive_timeout);
+        if limits(before) == limits(self.values.mapping.pubsub()) {
+            return;
+        }
+        if self.chunks.take().is_some_and(|chunks| chunks.is_open()) {
+            let about = About {
+                topic: None,
+                from: None,
+            };
+            self.values.count(about, Reason::Incomplete, 1, || {
+                "the mapping has other limits for large messages now".to_owned()
+            });
+        }
+    }
+}
+
+impl Values {
     /// Drops the deliveries that wait for the local side, because they have the previous type.
     pub(super) fn drop_deliveries(&mut self, topic: TopicId, why: &str) {
         let Some(entry) = self.topics.get_mut(&topic) else {
@@ -124,22 +164,6 @@ impl Router {
             self.count(About::topic(topic), Reason::NotPublished, count, || {
                 why.to_owned()
             });
-        }
-    }
-
-    /// Updates the description of a topic of the own space after a change of the mapping.
-    fn describe_again(&mut self, topic: TopicId, now: Now) {
-        if !self.is_home(topic) {
-            return;
-        }
-        let bound = self
-            .topics
-            .get(&topic)
-            .and_then(|entry| entry.bound.clone());
-        if let Some((message_type, selection)) = bound.as_deref() {
-            self.describe(topic, Some((message_type, selection)), now);
-        } else if self.settings.local == Local::Fields {
-            self.describe(topic, None, now);
         }
     }
 
@@ -196,23 +220,5 @@ impl Router {
         let rule = self.mapping.variable(topic).map(|v| v.publish);
         *gate = Gate::new(rule.unwrap_or_default());
         self.let_go(topic, held, now);
-    }
-
-    /// Applies changed limits for the reassembly of chunks. If they differ, incomplete messages are
-    /// given up.
-    fn renew_chunks(&mut self, before: &PubSub) {
-        let limits = |pubsub: &PubSub| (pubsub.max_message, pubsub.receive_timeout);
-        if limits(before) == limits(self.mapping.pubsub()) {
-            return;
-        }
-        if self.chunks.take().is_some_and(|chunks| chunks.is_open()) {
-            let about = About {
-                topic: None,
-                from: None,
-            };
-            self.count(about, Reason::Incomplete, 1, || {
-                "the mapping has other limits for large messages now".to_owned()
-            });
-        }
     }
 }

@@ -20,24 +20,24 @@ impl Router {
     /// Sets the description of an own value, and announces it at once and after each change. It is
     /// for a local side with fields as payload, and replaces the description in the mapping.
     pub fn describe_value(&mut self, topic: TopicId, description: ValueDescription, now: Now) {
-        if self.settings.local != Local::Fields || !self.is_home(topic) {
+        if self.values.settings.local != Local::Fields || !self.values.is_home(topic) {
             return;
         }
         let overflow = description.overflow;
-        let Some(entry) = self.follow(topic, None, now) else {
+        let Some(entry) = self.values.follow(topic, None, now) else {
             return;
         };
         entry.said = Some(Box::new(description));
         let rules = (overflow, Lasting::from(overflow));
         if (entry.overflow, entry.lasting) != rules {
-            self.requeue(topic, rules);
+            self.values.requeue(topic, rules);
         }
         self.describe(topic, None, now);
     }
 
     /// Stops the announcements of an own topic.
     pub(super) fn forget_described(&mut self, topic: TopicId) {
-        if let Some(entry) = self.topics.get_mut(&topic) {
+        if let Some(entry) = self.values.topics.get_mut(&topic) {
             entry.said = None;
             entry.description = None;
             entry.announce_at = None;
@@ -88,7 +88,7 @@ impl Router {
                 discovery.reckon();
             }
         }
-        if asked == self.settings.own {
+        if asked == self.values.settings.own {
             self.announce_calls(now);
         }
     }
@@ -96,22 +96,34 @@ impl Router {
     /// Probes the spaces of the mapping and the default spaces for their calls when the program
     /// starts. Otherwise the calls would be known only after their next periodic announcement.
     pub fn call_the_roll(&mut self, now: Now) {
-        let declared = self.mapping.spaces().iter().map(|space| space.id);
+        let declared = self.values.mapping.spaces().iter().map(|space| space.id);
         let usual = [0, 1, 2].into_iter().filter_map(SpaceId::new);
         let spaces: BTreeSet<SpaceId> = declared.chain(usual).collect();
         for space in spaces {
-            if space != self.settings.own || self.settings.own == SpaceId::UA {
+            if space != self.values.settings.own || self.values.settings.own == SpaceId::UA {
                 self.ask_for_calls(space, now);
             }
         }
     }
 
-    /// Probes a program of space 0 for its calls when it is first received. Programs of other
-    /// spaces announce each new call.
-    pub(super) fn meet(&mut self, topic: TopicId, now: Now) {
-        if topic.space != SpaceId::UA {
+    /// Sends the probes that values need.
+    pub(super) fn inquire(&mut self, now: Now) {
+        if self.values.inquiries.is_empty() {
             return;
         }
+        for topic in self.values.inquiries.take_met() {
+            self.meet(topic, now);
+        }
+        for topic in self.values.inquiries.take_topics() {
+            self.plan_probe(topic, now);
+        }
+        if self.values.inquiries.take_applications() {
+            self.ask_applications(now);
+        }
+    }
+
+    /// Probes a program for its calls when it is first received.
+    fn meet(&mut self, topic: TopicId, now: Now) {
         let (_, namespace, _) = topic.triple();
         let discovery = self.discovery(now);
         if discovery.met.len() < MAX_MET && discovery.met.insert((topic.space, namespace)) {
@@ -157,13 +169,13 @@ impl Router {
                 include_writer_groups: false,
                 include_data_set_writers: false,
             };
-            let mut bytes = self.buffer();
+            let mut bytes = self.values.buffer();
             let publisher = Some(PublisherId::UInt16(space.into()));
             if probe
                 .encode(publisher, SecurityHeader::NONE, &mut bytes)
                 .is_ok()
             {
-                self.tell(Output::Discovery { bytes });
+                self.values.tell(Output::Discovery { bytes });
             }
         }
     }
@@ -180,21 +192,21 @@ impl Router {
 
     /// Handles the announcement that a program does not have a value or call any more.
     pub(super) fn unlearn(&mut self, topic: TopicId, from: SocketAddr, now: Now) {
-        let timeout = self.mapping.pubsub().receive_timeout;
+        let timeout = self.values.mapping.pubsub().receive_timeout;
         if let Some(Topic {
             role: Role::Theirs(reader),
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.values.topics.get_mut(&topic)
             && reader.may_be(from, now.monotonic, timeout)
         {
             let left = reader.leave();
-            if self.settings.local != Local::Fields {
+            if self.values.settings.local != Local::Fields {
                 reader.withdraw();
             }
             if left {
-                self.tell_silence(topic);
+                self.values.tell_silence(topic);
             }
-            self.lose(topic, now);
+            self.values.lose(topic, now);
         }
         self.unlearn_call(topic, from);
         self.settle(now);

@@ -2,7 +2,7 @@
 
 use mappings::TopicId;
 
-use super::{About, Crossing, Router};
+use super::{About, Crossing, Router, Values};
 use crate::counters::Reason;
 use crate::network::chunk;
 use crate::output::Output;
@@ -14,10 +14,16 @@ impl Router {
     /// Returns the next output, topic by topic in turn. `None`: no output until the next
     /// `handle_*`.
     pub fn poll_output(&mut self, now: Now) -> Option<Output> {
+        let output = self.next_sealed(now);
+        self.inquire(now);
+        output
+    }
+
+    fn next_sealed(&mut self, now: Now) -> Option<Output> {
         self.check_lease(now);
         loop {
             let output = self.next_output(now)?;
-            if self.redundant.is_some() && self.mutes(&output) {
+            if self.values.redundant.is_some() && self.mutes(&output) {
                 self.drop_muted(output);
                 continue;
             }
@@ -36,22 +42,25 @@ impl Router {
 
     /// Returns the next output of [`poll_output`](Self::poll_output) before it is sealed.
     fn next_output(&mut self, now: Now) -> Option<Output> {
-        if let Some(told) = self.told.pop_front() {
+        if let Some(told) = self.values.told.pop_front() {
             return Some(told);
         }
-        if let Some(settled) = self.next_arrival() {
+        if let Some(settled) = self.values.next_arrival() {
             return Some(settled);
         }
         if self.calls.is_none() {
-            return self.next_value(now);
+            return self.values.next_value(now);
         }
         // Values and calls alternate, beginning with a value, so that the result of an action does
         // not overtake its last feedback.
         self.value_first = !self.value_first;
         let next = if self.value_first {
-            self.next_value(now).or_else(|| self.next_action(now))
+            self.values
+                .next_value(now)
+                .or_else(|| self.next_action(now))
         } else {
-            self.next_action(now).or_else(|| self.next_value(now))
+            self.next_action(now)
+                .or_else(|| self.values.next_value(now))
         };
         if next.is_none() {
             self.value_first = false;
@@ -59,6 +68,27 @@ impl Router {
         next
     }
 
+    /// Returns whether the queue of the topic is full, so that the next sample drops the oldest.
+    #[must_use]
+    pub fn is_full(&self, topic: TopicId) -> bool {
+        let entry = self.values.topics.get(&topic);
+        entry.is_some_and(|entry| entry.queue.is_full())
+    }
+
+    /// Records a datagram that could not be sent, and counts it under `reason` with `detail` for
+    /// one of its topics. The rest of a large message is not sent either.
+    pub fn not_sent(&mut self, topic: TopicId, reason: Reason, detail: &str) {
+        if let Some(entry) = self.values.topics.get_mut(&topic) {
+            entry.sending = None;
+        }
+        self.values
+            .count(About::topic(topic), (reason, "socket"), 1, || {
+                detail.to_owned()
+            });
+    }
+}
+
+impl Values {
     /// Returns the next notification about a topic, or the next sample to send or deliver.
     fn next_value(&mut self, now: Now) -> Option<Output> {
         // They alternate, so that many unknown topics do not block the values of other topics.
@@ -87,13 +117,6 @@ impl Router {
             }
         }
         None
-    }
-
-    /// Returns whether the queue of the topic is full, so that the next sample drops the oldest.
-    #[must_use]
-    pub fn is_full(&self, topic: TopicId) -> bool {
-        let entry = self.topics.get(&topic);
-        entry.is_some_and(|entry| entry.queue.is_full())
     }
 
     /// Takes an item of a topic, and requeues the topic if it has more items.
@@ -187,16 +210,5 @@ impl Router {
                 None
             }
         }
-    }
-
-    /// Records a datagram that could not be sent, and counts it under `reason` with `detail` for
-    /// one of its topics. The rest of a large message is not sent either.
-    pub fn not_sent(&mut self, topic: TopicId, reason: Reason, detail: &str) {
-        if let Some(entry) = self.topics.get_mut(&topic) {
-            entry.sending = None;
-        }
-        self.count(About::topic(topic), (reason, "socket"), 1, || {
-            detail.to_owned()
-        });
     }
 }

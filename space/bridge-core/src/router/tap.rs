@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 
 use mappings::TopicId;
 
-use super::Router;
+use super::{Router, Values};
 use crate::counters::{Cause, Reason};
 
 /// The tapped topics and the events that were not taken yet.
@@ -72,10 +72,10 @@ impl Router {
     /// Sets the tapped topics. Without topics, nothing is recorded.
     pub fn tap(&mut self, topics: &[TopicId]) {
         if topics.is_empty() {
-            self.tap = None;
+            self.values.tap = None;
             return;
         }
-        let tap = self.tap.get_or_insert_default();
+        let tap = self.values.tap.get_or_insert_default();
         if tap.topics != topics {
             tap.topics = topics.to_vec();
             tap.events.retain(|event| topics.contains(&event.topic));
@@ -85,20 +85,22 @@ impl Router {
     /// Returns whether topics are tapped.
     #[must_use]
     pub const fn is_tapped(&self) -> bool {
-        self.tap.is_some()
+        self.values.tap.is_some()
     }
 
     /// Takes the oldest event of the tapped topics.
     pub fn next_tapped(&mut self) -> Option<Tapped> {
-        self.tap.as_mut()?.events.pop_front()
+        self.values.tap.as_mut()?.events.pop_front()
     }
 
     /// Takes the number of events for which there was no room.
     pub fn take_lost_taps(&mut self) -> u64 {
-        let tap = self.tap.as_mut();
+        let tap = self.values.tap.as_mut();
         tap.map_or(0, |tap| std::mem::take(&mut tap.lost))
     }
+}
 
+impl Values {
     /// Records an event of a topic, if the topic is tapped.
     pub(super) fn note(&mut self, topic: TopicId, crossing: impl FnOnce() -> Crossing) {
         let Some(tap) = &mut self.tap else {

@@ -4,14 +4,14 @@ use std::net::SocketAddr;
 
 use mappings::TopicId;
 
-use super::Router;
+use super::Values;
 use crate::counters::{Cause, Reason, is_told};
 use crate::output::{Notice, Output};
 use crate::reader::Ask;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
-impl Router {
+impl Values {
     /// Counts drops, and reports them at the 1st, 10th, 100th ... occurrence of their cause.
     pub(super) fn count(
         &mut self,

@@ -151,7 +151,7 @@ impl Large {
 impl Router {
     /// Returns the maximum size of a datagram in bytes.
     pub(super) fn most(&self) -> usize {
-        self.sizes().0.into()
+        self.values.sizes().0.into()
     }
 
     /// Queues a request or response that is larger than a datagram.
@@ -169,12 +169,12 @@ impl Router {
 
     /// Returns the next chunk if the pace allows it, alternating with the chunks of values.
     pub(super) fn next_chunk(&mut self, now: Now) -> Option<Output> {
-        let values_wait = !self.paced.is_empty();
+        let values_wait = !self.values.paced.is_empty();
         let most = self.most();
-        let header = self.action_header(now);
+        let header = self.values.action_header(now);
         let calls = self.calls.as_mut()?;
         let chunking = &mut calls.chunking;
-        if chunking.is_empty() || !self.pace.is_open(now.monotonic) {
+        if chunking.is_empty() || !self.values.pace.is_open(now.monotonic) {
             return None;
         }
         if values_wait && !std::mem::replace(&mut chunking.gave_way, true) {
@@ -185,7 +185,7 @@ impl Router {
         let (topic, written) = chunking.write(most, &header, &mut bytes)?;
         match written {
             Ok(()) => {
-                self.pace.spend(bytes.len(), now.monotonic);
+                self.values.pace.spend(bytes.len(), now.monotonic);
                 Some(Output::Action { topic, bytes })
             }
             Err(error) => {

@@ -69,7 +69,7 @@ impl Router {
             return Err("the local side has no ROS types".to_owned());
         };
         let service = &offered.service_type;
-        let plan = ExecutedPlan::compile(service, (wire, &mut self.plans))?;
+        let plan = ExecutedPlan::compile(service, (wire, &mut self.values.plans))?;
         let fields = |message: &MessageType| {
             let leaves = message.leaves().iter();
             leaves.map(CallField::of).collect()
@@ -101,12 +101,14 @@ impl Router {
         (open, plan): (bool, Option<Arc<ExecutedPlan>>),
         now: Now,
     ) {
-        if !self.is_home(topic) {
-            return self.count(About::topic(topic), Reason::Looped, 1, String::new);
+        if !self.values.is_home(topic) {
+            return self
+                .values
+                .count(About::topic(topic), Reason::Looped, 1, String::new);
         }
-        let mapping = Arc::clone(&self.mapping);
+        let mapping = Arc::clone(&self.values.mapping);
         let namespaces = mapping.namespaces();
-        let period = self.mapping.pubsub().metadata_period;
+        let period = self.values.mapping.pubsub().metadata_period;
         let calls = self.calls_mut(now);
         let call = calls.table.entry(topic).or_default();
         let before = call.own.take().and_then(|own| own.announcement);
@@ -135,7 +137,7 @@ impl Router {
     /// Removes an own call or value that the local side does not have any more, and announces the
     /// removal. Running executions continue.
     pub fn withdraw(&mut self, topic: TopicId, now: Now) {
-        if !self.is_home(topic) {
+        if !self.values.is_home(topic) {
             return;
         }
         let calls = self.calls.as_mut();
@@ -144,7 +146,7 @@ impl Router {
         }
         self.unbind(topic, now);
         self.forget_described(topic);
-        let withheld = self.is_withheld(topic);
+        let withheld = self.values.is_withheld(topic);
         if !withheld {
             self.announce_none(topic);
         }
@@ -155,7 +157,11 @@ impl Router {
     pub fn withdraw_all(&mut self, now: Now) {
         let calls = self.calls.iter().flat_map(|calls| &calls.table);
         let calls = calls.filter(|(_, call)| call.own.is_some());
-        let said = self.topics.iter().filter(|(_, entry)| entry.said.is_some());
+        let said = self
+            .values
+            .topics
+            .iter()
+            .filter(|(_, entry)| entry.said.is_some());
         let topics = calls
             .map(|(topic, _)| *topic)
             .chain(said.map(|(topic, _)| *topic));
@@ -179,19 +185,19 @@ impl Router {
                 status: BAD_NOT_FOUND,
             },
         };
-        let mut bytes = self.buffer();
+        let mut bytes = self.values.buffer();
         let publisher = PublisherId::UInt16(space);
         if announcement
             .encode(publisher, SecurityHeader::NONE, &mut bytes)
             .is_ok()
         {
-            self.tell(Output::Discovery { bytes });
+            self.values.tell(Output::Discovery { bytes });
         }
     }
 
     /// Plans the announcements of all own calls.
     pub(in super::super) fn announce_calls(&mut self, now: Now) {
-        let period = self.mapping.pubsub().metadata_period;
+        let period = self.values.mapping.pubsub().metadata_period;
         let Some(calls) = &mut self.calls else {
             return;
         };
@@ -205,10 +211,10 @@ impl Router {
 
     /// Announces an own call.
     pub(in super::super) fn announce_call(&mut self, topic: TopicId, sequence: u16, now: Now) {
-        if self.is_withheld(topic) {
+        if self.values.is_withheld(topic) {
             return;
         }
-        let mut bytes = self.buffer();
+        let mut bytes = self.values.buffer();
         let call = self.calls.as_mut();
         let call = call.and_then(|calls| calls.table.get_mut(&topic));
         let own = call.and_then(|call| call.own.as_ref());
@@ -228,16 +234,19 @@ impl Router {
         from: SocketAddr,
         now: Now,
     ) {
-        if !self.may_cross(Side::Ua, What::Request, topic) || self.is_withheld(topic) {
+        if !self.values.may_cross(Side::Ua, What::Request, topic) || self.values.is_withheld(topic)
+        {
             return self.count_call(topic, Some(from), Reason::NotAsked, String::new);
         }
         let (_, namespace, _) = topic.triple();
         let origin = self.origin(namespace, from);
         // A sender with the keys of the group is trusted at any address.
         let known = origin.group != STRANGERS;
-        let group = self.mapping.pubsub().address;
+        let group = self.values.mapping.pubsub().address;
         let Some(calls) = &mut self.calls else {
-            return self.count(About::sender(from), Reason::NotAsked, 1, String::new);
+            return self
+                .values
+                .count(About::sender(from), Reason::NotAsked, 1, String::new);
         };
         let since = calls.since_start(now);
         let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
@@ -317,6 +326,7 @@ impl Router {
                 sender: from,
             },
             None if self
+                .values
                 .relay
                 .map_or_else(|| from.ip().is_loopback(), |relay| relay.authorized) =>
             {
@@ -338,7 +348,7 @@ impl Router {
         plan: Option<&ExecutedPlan>,
         fields: &[u8],
     ) -> Result<Vec<u8>, (Cause, String)> {
-        let mut request = self.buffer();
+        let mut request = self.values.buffer();
         match plan {
             Some(plan) => plan.request(fields, &mut request)?,
             None => request.extend_from_slice(fields),

@@ -169,14 +169,16 @@ impl Router {
         let named =
             named.filter(|(topic, _)| topic.space == space && topic.triple().2 == action.writer_id);
         let Some((topic, name)) = named else {
-            return self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            return self
+                .values
+                .count(About::sender(from), Reason::NotInSpace, 1, String::new);
         };
         let (_, namespace, _) = topic.triple();
         if self.guard.is_some() && self.is_unsaid(Some(namespace), from) {
             return;
         }
-        if self.is_home(topic) {
-            return self.drop_own(Some(namespace), from, now);
+        if self.values.is_home(topic) {
+            return self.values.drop_own(Some(namespace), from, now);
         }
         if !self.may_execute((space, namespace), from, now) {
             // The executor answers the probe. An executor that does not answer in time is lost.
@@ -292,20 +294,20 @@ impl Router {
             calls
                 .news
                 .push_back(Output::CallKnown { topic, description });
-            self.ask_of_values(topic, role, now);
+            self.ask_of_values(topic, role);
         }
     }
 
     /// Probes for the metadata of the values of an action. The first feedback may be sent with the
     /// first goal, and is dropped if its type is unknown.
-    fn ask_of_values(&mut self, topic: TopicId, role: CallRole, now: Now) {
+    fn ask_of_values(&mut self, topic: TopicId, role: CallRole) {
         let CallRole::Goal(family) = role else {
             return;
         };
         let (space, namespace, _) = topic.triple();
         for id in [family.feedback, family.status] {
             if let Some(value) = TopicId::new(space, namespace, id) {
-                self.ask_what(value, now);
+                self.values.ask_what(value);
             }
         }
     }
@@ -341,7 +343,7 @@ impl Router {
     /// probe. An executor without values is lost when its announcements are overdue. Either is lost
     /// when it does not answer a probe.
     fn silences(&self) -> (Duration, Duration) {
-        let pubsub = self.mapping.pubsub();
+        let pubsub = self.values.mapping.pubsub();
         let forgotten = pubsub.metadata_period.saturating_mul(MISSED);
         (pubsub.receive_timeout, forgotten)
     }
@@ -349,7 +351,7 @@ impl Router {
     /// Returns the time without values after which a program is probed. It leaves enough time for
     /// an answer, and is longer than the keep-alive period.
     fn missing(&self) -> Duration {
-        let pubsub = self.mapping.pubsub();
+        let pubsub = self.values.mapping.pubsub();
         let period = pubsub.keep_alive_period;
         let overdue = period.saturating_add(period / 4);
         overdue.max(pubsub.receive_timeout / 2)
@@ -409,7 +411,7 @@ impl Router {
     /// Removes the descriptions of calls that became own calls, and own calls that became calls of
     /// other programs.
     pub(in super::super) fn sort_calls(&mut self, now: Now) {
-        let (owned, own) = (self.owned.clone(), self.settings.own);
+        let (owned, own) = (self.values.owned.clone(), self.values.settings.own);
         let Some(calls) = &mut self.calls else {
             return;
         };

@@ -71,7 +71,7 @@ impl Router {
         if is_superseded {
             let active = sender.from;
             let cause = (Reason::Takeover, "superseded");
-            self.count(About::sender(from), cause, 1, || {
+            self.values.count(About::sender(from), cause, 1, || {
                 format!("{active} is the active bridge of space {space}, and {from} sent a value")
             });
         }
