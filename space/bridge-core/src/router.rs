@@ -1,11 +1,12 @@
 //! The Router: checks samples, queues them per topic, repeats values, and detects silent topics.
 
 mod announce;
-mod applications;
+mod announcements;
 mod batch;
 mod by_name;
 mod calls;
 mod chunks;
+mod claims;
 mod confirm;
 mod content;
 mod discovery;
@@ -14,11 +15,11 @@ mod guarded;
 mod held;
 mod inquiries;
 mod late;
+mod metadata;
 mod own;
 mod receive;
 mod redundant;
 mod reload;
-mod roll;
 mod send;
 mod tap;
 mod told;
@@ -47,12 +48,12 @@ use crate::settings::{Local, Now, Settings};
 use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message};
+use announcements::Announcements;
 pub(crate) use by_name::ByName;
 use calls::Calls;
 use chunks::Chunks;
-use discovery::Discovery;
-pub use redundant::MutedSamples;
 use redundant::ActiveSender;
+pub use redundant::MutedSamples;
 pub use tap::{Crossing, Tapped};
 use told::About;
 use values::Values;
@@ -64,8 +65,7 @@ pub struct Router {
     values: Values,
     /// The received chunks of large messages; `None` before the first chunk.
     chunks: Option<Box<Chunks>>,
-    /// Own and received metadata; `None` before the first use.
-    discovery: Option<Box<Discovery>>,
+    announcements: Announcements,
     /// Requested and executed calls; `None` before the first use.
     calls: Option<Box<Calls>>,
     /// Random bytes that distinguish own requests from requests of other programs.
@@ -87,10 +87,11 @@ impl Router {
     pub fn new(settings: Settings, mapping: Arc<Mapping>) -> Self {
         let guard = Guard::new(mapping.security()).map(Box::new);
         let overhead = guard.as_ref().map_or(0, |_| Guard::OVERHEAD);
+        let own = settings.own;
         Self {
             values: Values::new(settings, mapping, overhead),
             chunks: None,
-            discovery: None,
+            announcements: Announcements::new(own),
             calls: None,
             instance: [0; 16],
             guard,
@@ -208,7 +209,8 @@ impl Router {
                 continue;
             }
             entry.timer = None;
-            self.announce_again(topic, now);
+            self.announcements
+                .announce_again(&mut self.values, topic, now);
             self.values.handle_due(topic, now);
             self.values.settle_arrival(topic);
             self.values.schedule(topic);
@@ -216,7 +218,7 @@ impl Router {
         self.look_at_claims(now);
         self.look_at_calls(now);
         self.inquire(now);
-        self.discover(now);
+        self.announce_due(now);
         self.expire_chunks(now);
         if let Some(guard) = &mut self.guard {
             guard.turn(now.monotonic);
@@ -233,15 +235,21 @@ impl Router {
             false => self.values.pace.opens(),
         };
         let chunks = self.chunks.as_ref().and_then(|chunks| chunks.due());
-        let discovery = self.discovery_due();
+        let announcements = self.announcements.due();
         let calls = self.calls.as_ref().and_then(|calls| calls.due());
-        let claims = self.values.claims.as_ref();
-        let claims =
-            claims.and_then(|claims| claims.due(self.values.mapping.pubsub().receive_timeout));
+        let (_, _, silence) = self.values.periods();
+        let claims = self.values.claims.due(silence);
         let keys = self.guard.as_ref().and_then(|guard| guard.due());
         let redundancy = self.redundancy_due();
         [
-            timer, pace, chunks, discovery, calls, claims, keys, redundancy,
+            timer,
+            pace,
+            chunks,
+            announcements,
+            calls,
+            claims,
+            keys,
+            redundancy,
         ]
         .into_iter()
         .flatten()

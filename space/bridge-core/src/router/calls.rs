@@ -268,7 +268,7 @@ impl Router {
     /// is probed.
     pub fn want_call(&mut self, topic: TopicId, now: Now) {
         if self.described_call(topic).is_none() && !self.values.is_home(topic) {
-            self.plan_probe(topic, now);
+            self.announcements.probe(topic, now);
         }
     }
 
@@ -494,7 +494,7 @@ impl Router {
             Ok(uadp::action::Heard::Done(id, outcome)) => {
                 // The program may have restarted, and its announcement may have been lost.
                 if let Outcome::Unknown(Unknown::Lost) = outcome {
-                    self.plan_probe(topic, now);
+                    self.announcements.probe(topic, now);
                 }
                 self.conclude(id, outcome);
             }

@@ -85,7 +85,7 @@ impl Router {
         let counts = confirmer.is_some_and(|of| of.counts(from, now.monotonic));
         if !counts && !self.is_active_sender(space, from) {
             // The announcement of the bridge may have been lost.
-            self.ask_applications(now);
+            self.announcements.probe_applications(now);
             let cause = (Reason::Forged, "confirmation");
             self.values.count_only(about, cause, 1, || {
                 format!("{from} confirms for space {space}, which it did not announce or another sender did first")

@@ -1,51 +1,17 @@
 //! The namespaces of the space that only this program writes, and the handling of other programs
 //! that write them.
 
-use std::collections::BTreeMap;
 use std::net::SocketAddr;
-use std::time::{Duration, Instant};
 
 use mappings::TopicId;
-use uadp::discovery::{List, Probe};
-use uadp::{PublisherId, SecurityHeader};
 
+use super::announcements::WRITERS;
 use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::output::Output;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
-
-/// The own namespaces in which nothing is sent at the moment.
-#[derive(Debug, Default)]
-pub(super) struct Claims {
-    of: BTreeMap<u16, Claim>,
-}
-
-#[derive(Debug, Clone, Copy)]
-enum Claim {
-    /// The program waits until this time for messages of another writer.
-    Listening { until: Instant },
-    /// Another program writes the namespace.
-    Taken { heard: Instant },
-}
-
-impl Claims {
-    /// Returns the earliest time at which a namespace may be free.
-    pub(super) fn due(&self, silence: Duration) -> Option<Instant> {
-        let due = self.of.values().map(|claim| claim.ends(silence));
-        due.min()
-    }
-}
-
-impl Claim {
-    fn ends(self, silence: Duration) -> Instant {
-        match self {
-            Self::Listening { until } => until,
-            Self::Taken { heard } => heard + silence,
-        }
-    }
-}
 
 impl Router {
     /// Sets the namespaces of the space that only this program writes; initially all. Own topics in
@@ -69,11 +35,7 @@ impl Router {
             self.drop_topic(topic);
         }
         self.sort_calls(now);
-        if let Some(claims) = &mut self.values.claims {
-            claims
-                .of
-                .retain(|namespace, _| self.values.owned.has(*namespace));
-        }
+        self.values.claims.retain(&self.values.owned);
     }
 
     /// Probes for other writers of the own namespaces, and waits for a moment before anything is
@@ -84,49 +46,19 @@ impl Router {
         let Owned::Only(namespaces) = &self.values.owned else {
             return;
         };
-        let until = now.monotonic + LISTEN;
-        let claims = self.values.claims.get_or_insert_default();
-        for namespace in namespaces {
-            claims
-                .of
-                .entry(*namespace)
-                .or_insert(Claim::Listening { until });
-        }
-        let mut bytes = self.values.buffer();
-        let probe = Probe::PubSubConnections {
-            transport_profile_uris: List::null(),
-            include_writer_groups: false,
-            include_data_set_writers: false,
-        };
-        let publisher = Some(PublisherId::UInt16(self.values.settings.own.into()));
-        if probe
-            .encode(publisher, SecurityHeader::NONE, &mut bytes)
-            .is_ok()
-        {
-            self.values.tell(Output::Discovery { bytes });
-        }
+        let namespaces = namespaces.iter().copied();
+        self.values.claims.claim(namespaces, now.monotonic);
+        let own = self.values.settings.own;
+        self.values.send_probe(&WRITERS, Some(own));
     }
 
     /// Starts to send in free namespaces.
     pub(super) fn look_at_claims(&mut self, now: Now) {
         let (_, _, silence) = self.values.periods();
-        let Some(claims) = &mut self.values.claims else {
-            return;
-        };
-        let over = |claim: &Claim| claim.ends(silence) <= now.monotonic;
-        let free = claims.of.iter().filter(|(_, claim)| over(claim));
-        let free: Vec<(u16, Claim)> = free.map(|(of, claim)| (*of, *claim)).collect();
-        claims.of.retain(|_, claim| !over(claim));
-        if claims.of.is_empty() {
-            self.values.claims = None;
-        }
-        for (namespace, claim) in free {
-            let again = matches!(claim, Claim::Taken { .. });
+        for (namespace, again) in self.values.claims.poll(silence, now.monotonic) {
             if again {
-                self.values.tell(Output::Taken {
-                    namespace,
-                    by: None,
-                });
+                let by = None;
+                self.values.tell(Output::Taken { namespace, by });
             }
             self.send_again(namespace, again, now);
         }
@@ -154,7 +86,8 @@ impl Router {
                 entry.ready = true;
                 self.values.ready.push_back(topic);
             }
-            self.announce_again(topic, now);
+            self.announcements
+                .announce_again(&mut self.values, topic, now);
             self.values.schedule(topic);
         }
         self.announce_calls(now);
@@ -171,7 +104,7 @@ impl Router {
         {
             self.values.base_bytes = self.values.base_bytes.saturating_sub(base.weight());
         }
-        self.forget_described(topic);
+        self.announcements.forget(&mut self.values, topic);
     }
 }
 
@@ -187,18 +120,7 @@ impl Values {
 
     /// Records a message of another program in an own namespace.
     pub(super) fn contend(&mut self, namespace: u16, from: SocketAddr, now: Now) {
-        let claims = self.claims.as_mut();
-        let Some(claim) = claims.and_then(|claims| claims.of.get_mut(&namespace)) else {
-            // This program used the namespace before the other program.
-            return;
-        };
-        let before = std::mem::replace(
-            claim,
-            Claim::Taken {
-                heard: now.monotonic,
-            },
-        );
-        if matches!(before, Claim::Listening { .. }) {
+        if self.claims.contend(namespace, now.monotonic) {
             let by = Some(from);
             self.tell(Output::Taken { namespace, by });
         }
@@ -207,30 +129,19 @@ impl Values {
     /// Returns whether nothing of the topic may be sent at the moment.
     pub(super) fn is_withheld(&self, topic: TopicId) -> bool {
         let (_, namespace, _) = topic.triple();
-        let claims = self.claims.as_ref();
-        claims.is_some_and(|claims| {
-            topic.space == self.settings.own && claims.of.contains_key(&namespace)
-        })
-    }
-
-    /// Returns whether another program has used an own namespace before this program.
-    pub(super) fn is_taken(&self, namespace: u16) -> bool {
-        let claims = self.claims.as_ref();
-        let claim = claims.and_then(|claims| claims.of.get(&namespace));
-        matches!(claim, Some(Claim::Taken { .. }))
+        topic.space == self.settings.own && self.claims.withholds(namespace)
     }
 
     /// Keeps the waiting items of a topic while it is unknown whether the namespace is free, or
     /// drops them if it is taken.
     pub(super) fn withhold(&mut self, topic: TopicId) {
         let (_, namespace, _) = topic.triple();
-        let claim = self.claims.as_ref();
-        let claim = claim.and_then(|claims| claims.of.get(&namespace)).copied();
+        let is_taken = self.claims.is_taken(namespace);
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
         };
         entry.ready = false;
-        if matches!(claim, Some(Claim::Taken { .. })) {
+        if is_taken {
             let mut dropped = u64::from(entry.sending.take().is_some());
             while entry.take(&mut self.spare).is_some() {
                 dropped += 1;
@@ -244,6 +155,3 @@ impl Values {
         }
     }
 }
-
-/// The time to wait for other writers of a namespace, which respond within 100 ms.
-const LISTEN: Duration = Duration::from_millis(300);

@@ -180,7 +180,7 @@ impl Values {
             self.contend(namespace, from, now);
         }
         // `Output::Taken` already reported that nothing is sent in the namespace.
-        let told = shared.is_some_and(|namespace| self.is_taken(namespace));
+        let told = shared.is_some_and(|namespace| self.claims.is_taken(namespace));
         self.count(About::sender(from), Reason::SpaceTaken, 1, || match shared {
             Some(_) if told => String::new(),
             Some(namespace) => format!(

@@ -8,7 +8,6 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use mappings::{Lasting, TopicId};
-use uadp::discovery::{Included, Subject};
 use uadp::{MessageKind, NetworkMessage, NetworkMessageType, Timestamp};
 
 pub(super) use self::senders::ActiveSender;
@@ -620,7 +619,8 @@ impl Router {
                 self.values.recycle(delivery.payload);
             }
         }
-        self.introduce_again(now);
+        // Its confirmations count after its announcement.
+        self.announcements.plan_application(now);
     }
 
     /// Continues the sequence numbers of an own topic, and repeats its state.
@@ -660,21 +660,6 @@ impl Router {
                 .count_only(About::topic(topic), cause, 1, String::new);
         }
         self.values.schedule(topic);
-    }
-
-    /// Announces this program, so that its confirmations count.
-    fn introduce_again(&mut self, now: Now) {
-        let Some(discovery) = &mut self.discovery else {
-            return;
-        };
-        let since = discovery.since_start(now);
-        let subject = Subject::ApplicationInformation;
-        // A planned announcement already contains the information.
-        let _planned = discovery
-            .announcer
-            .announce(subject, Included::default(), since)
-            .is_ok();
-        discovery.reckon();
     }
 }
 

@@ -121,7 +121,7 @@ impl Values {
 
     /// Takes an item of a topic, and requeues the topic if it has more items.
     fn take_turn(&mut self, topic: TopicId, now: Now) -> Option<Output> {
-        if self.claims.is_some() && self.is_withheld(topic) {
+        if !self.claims.is_empty() && self.is_withheld(topic) {
             self.withhold(topic);
             return None;
         }

@@ -176,6 +176,11 @@ pub(super) struct About {
 }
 
 impl About {
+    pub(super) const NOTHING: Self = Self {
+        topic: None,
+        from: None,
+    };
+
     pub(super) const fn topic(topic: TopicId) -> Self {
         Self {
             topic: Some(topic),

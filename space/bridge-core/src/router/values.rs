@@ -7,9 +7,9 @@ use std::time::Instant;
 
 use mappings::{Mapping, SpaceId, TopicId};
 
+use super::claims::Claims;
 use super::follow::MAX_STRAYS;
 use super::inquiries::Inquiries;
-use super::own::Claims;
 use super::redundant::Redundant;
 use super::tap::Tap;
 use crate::confirm::Confirmer;
@@ -42,8 +42,7 @@ pub(super) struct Values {
     /// Topics with a partly sent large message, which wait for `pace`.
     pub(super) paced: VecDeque<TopicId>,
     pub(super) pace: Pace,
-    /// The own namespaces in which nothing is sent; `None` without such namespaces.
-    pub(super) claims: Option<Box<Claims>>,
+    pub(super) claims: Claims,
     /// The redundancy of the own space; `None` without redundancy.
     pub(super) redundant: Option<Box<Redundant>>,
     /// The broker between the programs; `None` for a network that does not store messages.
@@ -92,7 +91,7 @@ impl Values {
             ready: VecDeque::new(),
             paced: VecDeque::new(),
             pace: Pace::default(),
-            claims: None,
+            claims: Claims::default(),
             redundant: None,
             relay: None,
             confirmers: BTreeMap::new(),

@@ -15,6 +15,7 @@ use uadp::{Fields, PublisherId, SecurityHeader, StatusCode};
 
 use super::super::announce::BAD_NOT_FOUND;
 use super::super::receive::number_of;
+use super::super::values::Values;
 use super::super::{About, Router};
 use crate::call::{
     CallDescription, CallField, Executed, Execution, Offered, OfferedType, join_name,
@@ -126,7 +127,7 @@ impl Router {
         });
         calls.announce_at.get_or_insert(now.monotonic + period);
         calls.reckon();
-        self.plan_action(topic, now);
+        self.announcements.plan_call(topic, now);
         if let Some(error) = fault {
             self.count_call(topic, None, Reason::MetaData, || {
                 format!("what call {writer_id} takes and gives cannot be announced: {error}")
@@ -145,7 +146,7 @@ impl Router {
             call.own = None;
         }
         self.unbind(topic, now);
-        self.forget_described(topic);
+        self.announcements.forget(&mut self.values, topic);
         let withheld = self.values.is_withheld(topic);
         if !withheld {
             self.announce_none(topic);
@@ -205,24 +206,8 @@ impl Router {
         let own: Vec<TopicId> = own.map(|(topic, _)| *topic).collect();
         calls.announce_at = (!own.is_empty()).then(|| now.monotonic + period);
         for topic in own {
-            self.plan_action(topic, now);
+            self.announcements.plan_call(topic, now);
         }
-    }
-
-    /// Announces an own call.
-    pub(in super::super) fn announce_call(&mut self, topic: TopicId, sequence: u16, now: Now) {
-        if self.values.is_withheld(topic) {
-            return;
-        }
-        let mut bytes = self.values.buffer();
-        let call = self.calls.as_mut();
-        let call = call.and_then(|calls| calls.table.get_mut(&topic));
-        let own = call.and_then(|call| call.own.as_ref());
-        let Some(announcement) = own.and_then(|own| own.announcement.as_ref()) else {
-            return;
-        };
-        let body_at = announcement.write(sequence, &mut bytes);
-        self.send_announcement(topic, sequence, (bytes, body_at), now);
     }
 
     /// Handles a request, and passes it to the local side if it is for an own call and may be
@@ -456,6 +441,26 @@ impl Router {
 }
 
 impl super::Calls {
+    /// Sends the announcement of an own call.
+    pub(in super::super) fn announce(
+        &self,
+        values: &mut Values,
+        topic: TopicId,
+        sequence: u16,
+        now: Now,
+    ) {
+        if values.is_withheld(topic) {
+            return;
+        }
+        let own = self.table.get(&topic).and_then(|call| call.own.as_ref());
+        let Some(announcement) = own.and_then(|own| own.announcement.as_ref()) else {
+            return;
+        };
+        let mut bytes = values.buffer();
+        let body_at = announcement.write(sequence, &mut bytes);
+        values.send_announcement(topic, sequence, (bytes, body_at), now);
+    }
+
     /// Returns whether a request is for this instance of the program. After the announcement of a
     /// new instance, requestors use its new ActionTargetId.
     fn is_of_this_life(&self, request: &ActionMessage<'_>) -> bool {

@@ -182,7 +182,7 @@ impl Router {
         }
         if !self.may_execute((space, namespace), from, now) {
             // The executor answers the probe. An executor that does not answer in time is lost.
-            self.plan_probe(topic, now);
+            self.announcements.probe(topic, now);
             let cause = (Reason::MetaData, "sender");
             return self.count_call(topic, Some(from), cause, || {
                 "another program than the one that executes the calls of its namespace says what it is"
@@ -232,7 +232,7 @@ impl Router {
         let changed = before.map(|known| known.changed);
         if !same && changed.is_some_and(|at| now.monotonic < at + CHANGE_AFTER) {
             // The probe makes the program announce the call again when a change is accepted.
-            self.plan_probe(topic, now);
+            self.announcements.probe(topic, now);
             let cause = (Reason::MetaData, "too often");
             return self.count_call(topic, Some(from), cause, || {
                 "its program says too often that it is something else".to_owned()
@@ -279,7 +279,7 @@ impl Router {
             }
         }
         calls.reckon();
-        self.answered(topic, now);
+        self.announcements.call_known(topic);
         if same && !back {
             return;
         }
@@ -333,7 +333,7 @@ impl Router {
         let group = calls.and_then(|calls| calls.groups.get_mut(&(topic.space, namespace)));
         if let Some(group) = group.filter(|group| !group.gone) {
             group.doubted.get_or_insert(now.monotonic);
-            self.plan_probe(topic, now);
+            self.announcements.probe(topic, now);
         }
     }
 
@@ -404,7 +404,7 @@ impl Router {
         // Another program may execute the calls, or their executor has returned, or it executes
         // calls without sending values.
         for topic in asked {
-            self.plan_probe(topic, now);
+            self.announcements.probe(topic, now);
         }
     }
 

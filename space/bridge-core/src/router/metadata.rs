@@ -1,0 +1,267 @@
+//! Metadata of topics of other spaces, from their writers.
+
+use std::collections::HashMap;
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use mappings::{Mapping, TopicId};
+use uadp::discovery::DataSetMetaDataType;
+
+use super::About;
+use super::values::Values;
+use crate::counters::Reason;
+use crate::description::Described;
+use crate::layout::Layout;
+use crate::learned::{News, Rank};
+use crate::output::Output;
+use crate::reader::Ask;
+use crate::settings::{Local, Now};
+use crate::topic::{Role, Topic};
+
+impl Values {
+    /// Handles the metadata of a topic of another space. `answered` is called if the metadata is
+    /// accepted as an answer to a probe.
+    pub(super) fn learn(
+        &mut self,
+        topic: TopicId,
+        (meta_data, from): (&DataSetMetaDataType<'_>, SocketAddr),
+        answered: impl FnOnce(),
+        now: Now,
+    ) {
+        let about = About {
+            topic: Some(topic),
+            from: Some(from),
+        };
+        if !self.may_say(topic, from, now) {
+            return;
+        }
+        let shape = match self.topics.get(&topic).map(|entry| &entry.role) {
+            Some(Role::Theirs(reader)) => reader.shape.clone(),
+            Some(Role::Ours(_)) | None => None,
+        };
+        let fault = self.learn_layout(topic, meta_data, from, now).err();
+        if !self.is_learned(topic) {
+            answered();
+            if let Some(why) = fault {
+                self.count(about, Reason::MetaData, 1, || why);
+            }
+            return;
+        }
+        let described = match Described::read(meta_data) {
+            Ok(described) => described,
+            Err(why) => {
+                self.count(about, (Reason::MetaData, "useless"), 1, || why);
+                return;
+            }
+        };
+        answered();
+        if let Some(described) = &described
+            && shape.is_some()
+            && !self.may_be_renamed(topic, described, now)
+        {
+            self.count(about, (Reason::MetaData, "too often"), 1, || {
+                "its writer says too often that it is something else".to_owned()
+            });
+            return;
+        }
+        match self.take_note(topic, described, now) {
+            News::Same => {}
+            News::Full => self.count(about, (Reason::MetaData, "no room"), 1, || {
+                "there is no room for what more topics consist of".to_owned()
+            }),
+            News::Other => {
+                let counters = self.topics.get_mut(&topic);
+                let counters = counters.map_or(&mut self.others, |entry| &mut entry.counters);
+                counters.described += 1;
+                if !self.arrange(topic, now) && shape.is_some() {
+                    self.tell_unbound(topic);
+                }
+            }
+        }
+    }
+
+    /// Returns whether a sender may be the writer of a topic. Topics without values may have any
+    /// writer.
+    pub(super) fn may_be_writer(&self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
+        let timeout = self.mapping.pubsub().receive_timeout;
+        match self.topics.get(&topic).map(|of| &of.role) {
+            Some(Role::Theirs(reader)) => reader.may_be(from, now.monotonic, timeout),
+            Some(Role::Ours(_)) | None => true,
+        }
+    }
+
+    /// Handles the announcement of a writer that it does not have a topic any more.
+    pub(super) fn unlearn(&mut self, topic: TopicId, from: SocketAddr, now: Now) {
+        let timeout = self.mapping.pubsub().receive_timeout;
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+            && reader.may_be(from, now.monotonic, timeout)
+        {
+            let left = reader.leave();
+            if self.settings.local != Local::Fields {
+                reader.withdraw();
+            }
+            if left {
+                self.tell_silence(topic);
+            }
+            self.lose(topic, now);
+        }
+    }
+
+    /// Plans a probe for the metadata of a topic of another space.
+    pub(super) fn ask_what(&mut self, topic: TopicId) {
+        if self.is_learned(topic) {
+            self.inquiries.probe(topic);
+        }
+    }
+
+    /// Plans a probe for the fields of a topic if its messages cannot be read without them. The
+    /// rate of these probes is limited.
+    pub(super) fn ask_layout(&mut self, topic: TopicId, now: Now) {
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        let before = reader.asked_layout;
+        if before.is_none_or(|asked| now.monotonic >= asked + ASK_LAYOUT_AGAIN) {
+            reader.asked_layout = Some(now.monotonic);
+            self.inquiries.probe(topic);
+        }
+    }
+
+    /// Returns whether the local type of a topic may come from its writer, because the mapping does
+    /// not define it.
+    fn is_learned(&self, topic: TopicId) -> bool {
+        let own = self.settings.own;
+        let bound = self.mapping.variable(topic).is_some_and(|variable| {
+            let service = variable.service.as_ref();
+            variable.binding(own).is_some() || service.is_some_and(|service| service.space == own)
+        });
+        self.settings.local != Local::Fields && !bound
+    }
+
+    /// Returns whether the sender may announce the topic as its writer.
+    fn may_say(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
+        if self.may_be_writer(topic, from, now) {
+            return true;
+        }
+        // If the mapping defines the type, a restart at another port is not worth a log entry.
+        if self.is_learned(topic) {
+            let about = About {
+                topic: Some(topic),
+                from: Some(from),
+            };
+            self.count(about, (Reason::MetaData, "sender"), 1, || {
+                "another program than the one that sends its values says what they are".to_owned()
+            });
+        }
+        false
+    }
+
+    /// Stores the announced fields of a topic.
+    fn learn_layout(
+        &mut self,
+        topic: TopicId,
+        meta_data: &DataSetMetaDataType<'_>,
+        from: SocketAddr,
+        now: Now,
+    ) -> Result<(), String> {
+        let layout = Layout::read(meta_data, from)?;
+        let until = (now.monotonic, self.mapping.pubsub().metadata_period);
+        let rank = rank(&self.topics, &self.mapping, now.monotonic);
+        match self.layouts.learn(topic, layout, until, rank) {
+            News::Full => Err("there is no room for what the fields of more topics are".to_owned()),
+            News::Same | News::Other => Ok(()),
+        }
+    }
+
+    /// Stores the description of a topic. An announcement without a ROS type removes the stored
+    /// description.
+    fn take_note(&mut self, topic: TopicId, described: Option<Described>, now: Now) -> News {
+        let until = (now.monotonic, self.mapping.pubsub().metadata_period);
+        let Some(described) = described else {
+            self.learned.forget(topic);
+            return News::Same;
+        };
+        let rank = rank(&self.topics, &self.mapping, now.monotonic);
+        self.learned.learn(topic, described, until, rank)
+    }
+
+    /// Returns whether a topic with values may change to the description. The known description is
+    /// always accepted.
+    fn may_be_renamed(&mut self, topic: TopicId, described: &Described, now: Now) -> bool {
+        let known = self.learned.last(topic);
+        if known.is_some_and(|known| **known == *described) {
+            return true;
+        }
+        let known = known.is_some();
+        match self.topics.get_mut(&topic) {
+            Some(Topic {
+                role: Role::Theirs(reader),
+                ..
+            }) => reader.may_be_renamed(known, now.monotonic),
+            Some(_) | None => true,
+        }
+    }
+
+    /// Returns the request to the port for the local type of a topic with values of the given
+    /// shape, together with the known description. For a topic that already has a type, it requests
+    /// a check of the description.
+    pub(super) fn asked(
+        &mut self,
+        topic: TopicId,
+        ask: Ask,
+        shape: Vec<(uadp::BuiltinType, bool)>,
+        now: Now,
+    ) -> Option<Output> {
+        if self.arrange(topic, now) {
+            return None;
+        }
+        let described = self.learned.get(topic, now.monotonic).cloned();
+        let fits = described
+            .as_ref()
+            .is_none_or(|described| described.fits(&shape));
+        if ask == Ask::IfDescribed && (described.is_none() || !fits) {
+            return None;
+        }
+        if described.is_none() {
+            self.ask_what(topic);
+        }
+        if !fits {
+            self.count(About::topic(topic), (Reason::MetaData, "values"), 1, || {
+                "its values are not what its writer says they are".to_owned()
+            });
+        }
+        Some(Output::Unbound {
+            topic,
+            shape,
+            described: described.filter(|_| fits),
+        })
+    }
+}
+
+/// The minimum time between two probes of a writer for the fields of its messages.
+const ASK_LAYOUT_AGAIN: Duration = Duration::from_secs(10);
+
+/// Returns the precedence of topics when there is no room for all descriptions.
+fn rank(
+    topics: &HashMap<TopicId, Topic>,
+    mapping: &Mapping,
+    now: Instant,
+) -> impl Fn(TopicId) -> Rank {
+    let timeout = mapping.pubsub().receive_timeout;
+    move |topic| match topics.get(&topic).map(|of| &of.role) {
+        _ if mapping.variable(topic).is_some() => Rank::Mapped,
+        Some(Role::Theirs(reader))
+            if now.saturating_duration_since(reader.heard_at()) < timeout =>
+        {
+            Rank::Heard
+        }
+        Some(_) | None => Rank::Stray,
+    }
+}
