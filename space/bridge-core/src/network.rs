@@ -192,3 +192,14 @@ pub(crate) fn data_set_header(
         ..DataSetHeader::default()
     }
 }
+
+/// Returns the number of a PublisherId, and whether it is a UInt16.
+pub(crate) fn number_of(publisher: Option<PublisherId<'_>>) -> (u64, bool) {
+    match publisher {
+        Some(PublisherId::UInt16(number)) => (u64::from(number), true),
+        Some(PublisherId::Byte(number)) => (u64::from(number), false),
+        Some(PublisherId::UInt32(number)) => (u64::from(number), false),
+        Some(PublisherId::UInt64(number)) => (number, false),
+        Some(PublisherId::String(_)) | None => (u64::MAX, false),
+    }
+}

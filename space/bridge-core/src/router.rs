@@ -17,9 +17,11 @@ mod inquiries;
 mod late;
 mod metadata;
 mod own;
+mod reassembly;
 mod receive;
 mod redundant;
 mod reload;
+mod security;
 mod send;
 mod tap;
 mod told;
@@ -38,7 +40,6 @@ use crate::confirm::Handover;
 use crate::counters::{Cause, Counters, Reason, Verdict};
 use crate::fields;
 use crate::gate::{Passage, Waiting};
-use crate::guard::Guard;
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Side, What};
 use crate::loss::{Loss, Reaction, Stop, trigger};
@@ -51,9 +52,10 @@ use crate::writer::{Encoded, Idle, MAX_KEPT, Message};
 use announcements::Announcements;
 pub(crate) use by_name::ByName;
 use calls::Calls;
-use chunks::Chunks;
+use reassembly::Reassembly;
 use redundant::ActiveSender;
 pub use redundant::MutedSamples;
+use security::Security;
 pub use tap::{Crossing, Tapped};
 use told::About;
 use values::Values;
@@ -63,19 +65,15 @@ use values::Values;
 #[derive(Debug)]
 pub struct Router {
     values: Values,
-    /// The received chunks of large messages; `None` before the first chunk.
-    chunks: Option<Box<Chunks>>,
+    reassembly: Reassembly,
     announcements: Announcements,
     /// Requested and executed calls; `None` before the first use.
     calls: Option<Box<Calls>>,
     /// Random bytes that distinguish own requests from requests of other programs.
     instance: [u8; 16],
-    /// The secured groups; `None` without secured groups.
-    guard: Option<Box<Guard>>,
+    security: Security,
     /// The redundant bridges of other spaces.
     redundant_senders: BTreeMap<SpaceId, ActiveSender>,
-    /// Whether the message in processing was received unsecured.
-    in_clear: bool,
     /// Whether a value was polled before a call last time.
     value_first: bool,
 }
@@ -85,18 +83,17 @@ impl Router {
     /// repetitions.
     #[must_use]
     pub fn new(settings: Settings, mapping: Arc<Mapping>) -> Self {
-        let guard = Guard::new(mapping.security()).map(Box::new);
-        let overhead = guard.as_ref().map_or(0, |_| Guard::OVERHEAD);
+        let security = Security::new(mapping.security());
+        let overhead = security.overhead();
         let own = settings.own;
         Self {
             values: Values::new(settings, mapping, overhead),
-            chunks: None,
+            reassembly: Reassembly::default(),
             announcements: Announcements::new(own),
             calls: None,
             instance: [0; 16],
-            guard,
+            security,
             redundant_senders: BTreeMap::new(),
-            in_clear: true,
             value_first: false,
         }
     }
@@ -219,11 +216,9 @@ impl Router {
         self.look_at_calls(now);
         self.inquire(now);
         self.announce_due(now);
-        self.expire_chunks(now);
-        if let Some(guard) = &mut self.guard {
-            guard.turn(now.monotonic);
-            self.want_keys(now);
-        }
+        self.reassembly.expire(&mut self.values, now);
+        self.security.turn(now.monotonic);
+        self.want_keys(now);
     }
 
     /// Returns the time of the next [`handle_timeout`](Self::handle_timeout).
@@ -234,12 +229,12 @@ impl Router {
             true => None,
             false => self.values.pace.opens(),
         };
-        let chunks = self.chunks.as_ref().and_then(|chunks| chunks.due());
+        let chunks = self.reassembly.due();
         let announcements = self.announcements.due();
         let calls = self.calls.as_ref().and_then(|calls| calls.due());
         let (_, _, silence) = self.values.periods();
         let claims = self.values.claims.due(silence);
-        let keys = self.guard.as_ref().and_then(|guard| guard.due());
+        let keys = self.security.due();
         let redundancy = self.redundancy_due();
         [
             timer,

@@ -174,7 +174,7 @@ impl Router {
     /// earlier instances. Call it before the first call is known.
     pub fn set_instance(&mut self, instance: [u8; 16]) {
         self.instance = instance;
-        self.mark_guard();
+        self.security.set_instance(instance);
     }
 
     fn calls_mut(&mut self, now: Now) -> &mut Calls {

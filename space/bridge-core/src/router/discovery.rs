@@ -200,7 +200,7 @@ impl Router {
             } => {
                 let named = meta_data.name.and_then(split_name);
                 let namespace = named.map(|(topic, _)| topic.triple().1);
-                if self.guard.is_some() && self.is_unsaid(namespace, from) {
+                if self.is_unsaid(namespace, from) {
                     return;
                 }
                 self.learn_value((*writer_id, *status), meta_data, (space, from), now);

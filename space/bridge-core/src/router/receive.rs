@@ -6,7 +6,7 @@ use std::time::Duration;
 use mappings::{PublisherIdRule, SpaceId, TopicId};
 use uadp::{
     DataSetHeader, DataSetMessage, DecodeError, Fields, MessageKind, NetworkHeader, NetworkMessage,
-    NetworkMessageType, PublisherId, Timestamp,
+    NetworkMessageType, Timestamp,
 };
 
 use super::content::Quality;
@@ -17,6 +17,7 @@ use crate::counters::Reason;
 use crate::fields;
 use crate::hops::Hop;
 use crate::loop_rule::{Owned, Side, What, may_cross};
+use crate::network::number_of;
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
 use crate::reader::{Admitted, Handling};
@@ -28,7 +29,7 @@ impl Router {
     /// counted.
     pub fn handle_datagram(&mut self, datagram: &[u8], from: SocketAddr, now: Now) {
         match NetworkMessage::decode(datagram) {
-            Ok(message) if self.guard.is_some() => self.handle_guarded(&message, from, now),
+            Ok(message) if self.security.is_on() => self.handle_guarded(&message, from, now),
             Ok(message) => self.handle_network_message(&message, from, now),
             Err(error) => self.values.drop_undecoded(None, from, &error),
         }
@@ -582,17 +583,6 @@ pub(super) struct Sample<'a> {
     pub(super) lasting: bool,
     pub(super) status: u16,
     pub(super) arrived: Timestamp,
-}
-
-/// Returns the number of a PublisherId, and whether it is a UInt16.
-pub(super) fn number_of(publisher: Option<PublisherId<'_>>) -> (u64, bool) {
-    match publisher {
-        Some(PublisherId::UInt16(number)) => (u64::from(number), true),
-        Some(PublisherId::Byte(number)) => (u64::from(number), false),
-        Some(PublisherId::UInt32(number)) => (u64::from(number), false),
-        Some(PublisherId::UInt64(number)) => (number, false),
-        Some(PublisherId::String(_)) | None => (u64::MAX, false),
-    }
 }
 
 /// Returns the time at which a NetworkMessage was sent.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use mappings::{Lasting, Mapping, Overflow, PubSub, TopicId};
+use mappings::{Lasting, Mapping, Overflow, TopicId};
 use messages::Wire;
 
 use super::{About, Router, Values};
@@ -29,8 +29,9 @@ impl Router {
     /// and [`bind`](Self::bind) for new bindings.
     pub fn replace_mapping(&mut self, mapping: Arc<Mapping>, now: Now) {
         let before = std::mem::replace(&mut self.values.mapping, mapping);
-        self.renew_chunks(before.pubsub());
-        self.renew_guard();
+        self.reassembly.renew(&mut self.values, before.pubsub());
+        self.security.replace(self.values.mapping.security());
+        self.values.overhead = self.security.overhead();
         let receive_timeout = self.values.mapping.pubsub().receive_timeout;
         if let Some(calls) = &mut self.calls {
             calls.set_receive_timeout(receive_timeout);
@@ -130,24 +131,6 @@ impl Router {
             self.describe(topic, Some((message_type, selection)), now);
         } else if self.values.settings.local == Local::Fields {
             self.describe(topic, None, now);
-        }
-    }
-
-    /// Applies changed limits for the reassembly of chunks. If they differ, incomplete messages are
-    /// given up.
-    fn renew_chunks(&mut self, before: &PubSub) {
-        let limits = |pubsub: &PubSub| (pubsub.max_message, pubsub.receive_timeout);
-        if limits(before) == limits(self.values.mapping.pubsub()) {
-            return;
-        }
-        if self.chunks.take().is_some_and(|chunks| chunks.is_open()) {
-            let about = About {
-                topic: None,
-                from: None,
-            };
-            self.values.count(about, Reason::Incomplete, 1, || {
-                "the mapping has other limits for large messages now".to_owned()
-            });
         }
     }
 }

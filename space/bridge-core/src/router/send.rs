@@ -27,11 +27,11 @@ impl Router {
                 self.drop_muted(output);
                 continue;
             }
-            if self.guard.is_none() {
+            if !self.security.is_on() {
                 return Some(output);
             }
             let is_heartbeat = matches!(output, Output::Heartbeat { .. });
-            if let Some(output) = self.sealed(output) {
+            if let Some(output) = self.security.seal(&mut self.values, output) {
                 return Some(output);
             }
             if is_heartbeat {

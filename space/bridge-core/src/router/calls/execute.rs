@@ -14,7 +14,6 @@ use uadp::discovery::{Announced, Announcement, DataSetMetaDataType};
 use uadp::{Fields, PublisherId, SecurityHeader, StatusCode};
 
 use super::super::announce::BAD_NOT_FOUND;
-use super::super::receive::number_of;
 use super::super::values::Values;
 use super::super::{About, Router};
 use crate::call::{
@@ -24,6 +23,7 @@ use crate::call_announcement::{CallAnnouncement, LASTING_TARGET, Types};
 use crate::call_plan::ExecutedPlan;
 use crate::counters::{Cause, Reason};
 use crate::loop_rule::{Side, What};
+use crate::network::number_of;
 use crate::output::Output;
 use crate::settings::Now;
 
@@ -303,9 +303,7 @@ impl Router {
     /// which have its keys, and programs of this host are distinguished by address and port. All
     /// ports of another host share a limit.
     fn origin(&self, namespace: u16, from: SocketAddr) -> RequestOrigin<SocketAddr> {
-        let guard = self.guard.as_ref();
-        let secured = guard.and_then(|guard| guard.group_of(namespace));
-        match secured {
+        match self.security.group_of(namespace) {
             Some(at) => RequestOrigin {
                 group: SECURED.saturating_add(at),
                 sender: from,

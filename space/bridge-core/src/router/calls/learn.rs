@@ -174,7 +174,7 @@ impl Router {
                 .count(About::sender(from), Reason::NotInSpace, 1, String::new);
         };
         let (_, namespace, _) = topic.triple();
-        if self.guard.is_some() && self.is_unsaid(Some(namespace), from) {
+        if self.is_unsaid(Some(namespace), from) {
             return;
         }
         if self.values.is_home(topic) {

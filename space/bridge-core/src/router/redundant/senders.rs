@@ -84,7 +84,7 @@ impl Router {
         let sender = self.redundant_senders.get(&space);
         let is_active =
             sender.is_some_and(|sender| sender.from == from && sender.heartbeat.is_active());
-        is_active && self.guard.is_some() && !self.in_clear
+        is_active && self.security.is_authentic()
     }
 }
 
