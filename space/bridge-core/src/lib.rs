@@ -14,6 +14,8 @@
 mod application;
 mod base;
 mod block;
+mod buffers;
+mod by_name;
 mod call;
 mod call_announcement;
 mod call_plan;
@@ -25,6 +27,7 @@ mod fields;
 mod gate;
 mod guard;
 mod hops;
+mod late;
 mod layout;
 mod learned;
 mod loop_rule;
@@ -41,7 +44,9 @@ mod room;
 mod router;
 mod settings;
 mod takes;
+mod tap;
 mod topic;
+mod topics;
 mod transcoder;
 mod writer;
 
@@ -64,7 +69,8 @@ pub use redundancy::{
     SwitchRefusal, Takeover, TakeoverCause,
 };
 pub use room::Room;
-pub use router::{Crossing, MutedSamples, Router, Tapped};
+pub use router::{MutedSamples, Router};
 pub use settings::{Local, Now, Relay, Settings};
+pub use tap::{Crossing, Tapped};
 pub use uadp::action::{ExecutionId, Refusal};
 pub use uadp::discovery::MessageSecurityMode;

@@ -227,3 +227,6 @@ pub struct Notice {
     /// The details in words.
     pub detail: String,
 }
+
+/// The upper 16 bits of the StatusCode Good.
+pub(crate) const GOOD: u16 = 0;

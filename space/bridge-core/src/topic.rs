@@ -6,6 +6,8 @@ use std::time::{Duration, Instant};
 use mappings::{Lasting, Overflow};
 use messages::{MessageType, Plan, Selection};
 
+use crate::buffers::Buffers;
+use crate::by_name::ByName;
 use crate::call::ValueDescription;
 use crate::confirm::Confirming;
 use crate::counters::Counters;
@@ -15,7 +17,6 @@ use crate::loss::{Loss, Stop};
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
-use crate::router::ByName;
 use crate::takes::Takes;
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Message, Writer};
@@ -130,24 +131,24 @@ impl Topic {
     }
 
     /// Returns the next item of the queue, or else the next repetition, which is written into a
-    /// buffer of `spare`.
-    pub(crate) fn take(&mut self, spare: &mut Vec<Vec<u8>>) -> Option<Item> {
+    /// buffer of `buffers`.
+    pub(crate) fn take(&mut self, buffers: &mut Buffers) -> Option<Item> {
         if let Some(item) = self.queue.pop() {
             return Some(item);
         }
         let Role::Ours(writer) = &mut self.role else {
             return None;
         };
-        let again = writer.repeat(|| spare.pop().unwrap_or_default())?;
+        let again = writer.repeat(|| buffers.take())?;
         self.counters.repeated += 1;
         Some(Item::Message(again))
     }
 
     /// Returns the next item as [`take`](Self::take) does, if it is a datagram with a
     /// DataSetMessage of at most `most` bytes.
-    pub(crate) fn take_within(&mut self, most: usize, spare: &mut Vec<Vec<u8>>) -> Option<Encoded> {
+    pub(crate) fn take_within(&mut self, most: usize, buffers: &mut Buffers) -> Option<Encoded> {
         self.next_size().filter(|size| *size <= most)?;
-        match self.take(spare) {
+        match self.take(buffers) {
             Some(Item::Message(Message::Datagram(datagram))) => Some(datagram),
             Some(_) | None => None,
         }

@@ -4,7 +4,7 @@ use mappings::{SpaceId, TopicId};
 use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, Probe};
 use uadp::{PublisherId, SecurityHeader};
 
-use super::About;
+use super::about::About;
 use super::values::Values;
 use crate::counters::Reason;
 use crate::network::announcement_chunks;

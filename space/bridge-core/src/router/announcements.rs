@@ -17,7 +17,7 @@ use uadp::discovery::{
 use self::applications::Applications;
 use self::probes::MetadataProbes;
 use self::rolls::Rolls;
-use super::About;
+use super::about::About;
 use super::values::Values;
 use crate::application::Application;
 use crate::counters::Reason;
@@ -329,7 +329,7 @@ impl Announcements {
         }
         self.announcer.add_writer(namespace, writer_id);
         self.plan_value(topic, now);
-        values.schedule(topic);
+        values.schedule_topic(topic);
     }
 
     /// Stops the announcements of an own topic.

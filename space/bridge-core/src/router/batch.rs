@@ -2,22 +2,21 @@
 
 use mappings::{Overflow, TopicId};
 
-use super::{About, Crossing, Values};
+use super::about::About;
+use super::values::Values;
 use crate::counters::Reason;
 use crate::network::join;
 use crate::output::Output;
 use crate::settings::Now;
+use crate::tap::Crossing;
+use crate::topics::Handle;
 use crate::writer::Encoded;
 
 impl Values {
     /// Returns the datagram of a sample, together with other waiting samples of its WriterGroup if
     /// the mapping allows it.
-    pub(super) fn datagram(
-        &mut self,
-        topic: TopicId,
-        mut first: Encoded,
-        now: Now,
-    ) -> Option<Output> {
+    pub(super) fn datagram(&mut self, at: Handle, mut first: Encoded, now: Now) -> Option<Output> {
+        let topic = at.topic();
         // Each topic of a broker has its own messages.
         let others = match self.relay {
             None => self.gather(topic, &first),
@@ -25,7 +24,7 @@ impl Values {
         };
         let with = others.iter().map(|(topic, _)| *topic).collect();
         if others.is_empty() {
-            if !self.keeps_time(topic) {
+            if !self.keeps_time(at) {
                 first.stamp(now.utc);
             }
             return Some(Output::Datagram {
@@ -72,25 +71,28 @@ impl Values {
             let Some(next) = self.ready.pop_front() else {
                 break;
             };
-            let joins = next.triple().1 == topic.triple().1
-                && !(self.keeps_latest(next) && is_in(next, topic, &gathered));
-            let taken = self
-                .topics
-                .get_mut(&next)
-                .filter(|_| joins)
-                .and_then(|entry| {
-                    let before = entry.counters.repeated;
-                    let taken = entry.take_within(left, &mut self.spare)?;
-                    let repeated = entry.counters.repeated != before;
-                    entry.counters.sent += 1;
-                    entry.ready = entry.has_more();
-                    Some((taken, entry.ready, repeated))
-                });
+            let Some(entry) = self.topics.at_mut(next) else {
+                continue;
+            };
+            let is_alone = entry.overflow == Overflow::KeepLatest;
+            let joins = next.topic().triple().1 == topic.triple().1
+                && !(is_alone && is_in(next.topic(), topic, &gathered));
+            let before = entry.counters.repeated;
+            let taken = match joins {
+                true => entry.take_within(left, &mut self.buffers),
+                false => None,
+            };
+            let taken = taken.map(|taken| {
+                let repeated = entry.counters.repeated != before;
+                entry.counters.sent += 1;
+                entry.ready = entry.has_more();
+                (taken, entry.ready, repeated)
+            });
             match taken {
                 Some((taken, has_more, repeated)) => {
-                    self.note(next, || Crossing::Sent { repeated });
+                    self.tap.note(next.topic(), || Crossing::Sent { repeated });
                     len += ID + SIZE + taken.data_set_message().len();
-                    gathered.push((next, taken));
+                    gathered.push((next.topic(), taken));
                     if has_more {
                         self.ready.push_back(next);
                     }
@@ -102,13 +104,6 @@ impl Values {
             self.ready.push_front(topic);
         }
         gathered
-    }
-
-    /// Returns whether only the latest sample of a topic waits to be sent.
-    pub(super) fn keeps_latest(&self, topic: TopicId) -> bool {
-        self.topics
-            .get(&topic)
-            .is_some_and(|entry| entry.overflow == Overflow::KeepLatest)
     }
 }
 

@@ -2,48 +2,15 @@
 
 use std::sync::Arc;
 
-use mappings::{FieldMap, Lasting, TopicId};
-use messages::{MessageType, Plan, PlanError, Selection};
-use uadp::Fields;
+use mappings::{Lasting, TopicId};
+use messages::{MessageType, PlanError, Selection};
 
 use super::{About, Router, Values};
-use crate::call::{CallDescription, CallField, CallRole, Origin, ValueDescription, ValueNote};
-use crate::call_plan;
-use crate::counters::{Cause, Reason};
-use crate::description::Described;
-use crate::fields;
+use crate::by_name::ByName;
+use crate::call::{ValueDescription, ValueNote};
+use crate::counters::Reason;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
-
-/// Converts the fields of a value of another space to a message, in any order of the fields.
-#[derive(Debug)]
-pub(crate) struct ByName {
-    message_type: Arc<MessageType>,
-    /// The assignments of fields that are not assigned by name.
-    map: FieldMap,
-    /// The description from the writer, and the indexes of the used fields in the order of the
-    /// message.
-    arranged: Option<(Arc<Described>, Vec<Origin>)>,
-}
-
-impl ByName {
-    /// Appends the message of the fields.
-    pub(crate) fn write(
-        &self,
-        plan: &Plan,
-        fields: &[u8],
-        out: &mut Vec<u8>,
-    ) -> Result<(), (Cause, String)> {
-        let order = self.arranged.as_ref();
-        let order = order.map_or(&[][..], |(_, order)| order);
-        let fields = call_plan::arrange(fields, order)?;
-        fields::write(
-            plan,
-            Fields::parse(&fields).map_err(fields::undecodable)?,
-            out,
-        )
-    }
-}
 
 impl Router {
     /// Binds a value that is not in the mapping. Otherwise it works as [`bind`](Self::bind).
@@ -66,7 +33,8 @@ impl Router {
             overflow,
             map,
         } = note;
-        let Some(entry) = self.values.follow(topic, None, now) else {
+        let at = self.values.follow(topic, now);
+        let Some(entry) = self.values.topics.at_mut(at) else {
             return Ok(());
         };
         let ours = matches!(entry.role, Role::Ours(_));
@@ -80,11 +48,7 @@ impl Router {
             }));
         } else {
             entry.plan = None;
-            entry.by_name = Some(Box::new(ByName {
-                message_type: Arc::clone(message_type),
-                map,
-                arranged: None,
-            }));
+            entry.by_name = Some(Box::new(ByName::new(message_type, map)));
         }
         let rules = (overflow, Lasting::from(overflow));
         if (entry.overflow, entry.lasting) != rules {
@@ -115,18 +79,11 @@ impl Values {
             self.ask_what(topic);
             return true;
         };
-        if let Some((known, _)) = &by_name.arranged
-            && *known == described
-        {
-            return true;
-        }
-        let message_type = Arc::clone(&by_name.message_type);
-        let bound = match order(&described, (&message_type, &by_name.map)) {
-            Ok((selection, order)) => {
-                by_name.arranged = Some((described, order));
-                let bound = self.bind_type(topic, (&message_type, &selection), now);
-                bound.map_err(|error| error.to_string())
-            }
+        let bound = match by_name.arrange(described) {
+            Ok(None) => return true,
+            Ok(Some((message_type, selection))) => self
+                .bind_type(topic, (&message_type, &selection), now)
+                .map_err(|error| error.to_string()),
             Err(why) => Err(why),
         };
         if let Err(why) = bound {
@@ -135,21 +92,4 @@ impl Values {
         }
         true
     }
-}
-
-/// Returns the selection of fields in the message, and the index of the source field for each.
-fn order(
-    described: &Described,
-    (message_type, map): (&MessageType, &FieldMap),
-) -> Result<(Selection, Vec<Origin>), String> {
-    let fields = described.fields.iter().map(CallField::of).collect();
-    let call = CallDescription {
-        name: String::new(),
-        about: String::new(),
-        role: CallRole::Call,
-        request: Vec::new(),
-        response: fields,
-    };
-    let (selection, order) = call.response_order(message_type, map)?;
-    Ok((selection, order.into_iter().map(Origin::Leaf).collect()))
 }

@@ -27,12 +27,13 @@ use uadp::{
 use self::chunks::{Chunking, Of};
 use self::execute::{Own, Running};
 use self::learn::{Group, Known};
-use super::{About, Router, late};
+use super::{About, Router};
 use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap};
 use crate::call_announcement::{LASTING_TARGET, target_of};
 use crate::call_plan::CallPlan;
 use crate::counters::{Cause, Reason};
 use crate::fields;
+use crate::late;
 use crate::loop_rule::{Side, What};
 use crate::output::Output;
 use crate::settings::{Local, Now};
@@ -603,7 +604,7 @@ impl Router {
             if let Some(chunk) = self.next_chunk(now) {
                 return Some(chunk);
             }
-            let mut bytes = self.values.spare.pop().unwrap_or_default();
+            let mut bytes = self.values.buffer();
             match self.write_action(&mut bytes, now) {
                 Some(Told::Datagram(topic, _)) if bytes.len() <= self.most() => {
                     return Some(Output::Action { topic, bytes });
@@ -675,7 +676,7 @@ impl Router {
         let call = self.calls.as_mut();
         let counters = match call.and_then(|calls| calls.table.get_mut(&topic)) {
             Some(call) => &mut call.counters.drops,
-            None => &mut self.values.others,
+            None => self.values.topics.others_mut(),
         };
         let total = counters.add(cause, 1);
         let about = About {

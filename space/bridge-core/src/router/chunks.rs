@@ -11,7 +11,6 @@ use super::receive::sent;
 use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::settings::Now;
-use crate::topic::{Role, Topic};
 
 impl Router {
     /// Stores a chunk of another space. A complete message is handled as any other message.
@@ -92,16 +91,15 @@ impl Router {
 impl Values {
     /// Records a message of the writer of a topic. Returns false if there is no room for the topic.
     fn hear(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.entry(topic, from, now)
-        else {
+        let Some(at) = self.entry(topic, from, now) else {
+            return false;
+        };
+        let Some(reader) = self.topics.reader(at) else {
             return false;
         };
         reader.heard(now.monotonic);
         if reader.lives(now.monotonic) {
-            self.tell_returned(topic);
+            self.tell_returned(at);
         }
         true
     }

@@ -15,6 +15,7 @@ use crate::place::Place;
 use crate::reader::Admitted;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
+use crate::topics::Handle;
 
 impl Router {
     /// Returns whether a delivery needs a confirmation. The caller then reports its [`Handover`]
@@ -30,11 +31,7 @@ impl Router {
     /// delivery that has arrived is confirmed. A delivery without a subscriber is delivered again
     /// when its writer repeats it in time.
     pub fn handed(&mut self, topic: TopicId, instance: Option<Timestamp>, handover: Handover) {
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.values.topics.get_mut(&topic)
-        else {
+        let Some(reader) = self.values.topics.reader_of(topic) else {
             return;
         };
         let receipt = reader.receipt.as_mut();
@@ -65,11 +62,7 @@ impl Router {
         if !self.values.is_home(topic) || is_own {
             return true;
         }
-        let Some(Topic {
-            role: Role::Ours(writer),
-            ..
-        }) = self.values.topics.get_mut(&topic)
-        else {
+        let Some(writer) = self.values.topics.writer_of(topic) else {
             return true;
         };
         let about = About {
@@ -92,11 +85,7 @@ impl Router {
             });
             return true;
         }
-        if let Some(Topic {
-            role: Role::Ours(writer),
-            ..
-        }) = self.values.topics.get_mut(&topic)
-        {
+        if let Some(writer) = self.values.topics.writer_of(topic) {
             writer.confirm(space);
         }
         self.values.settle_arrival(topic);
@@ -186,8 +175,8 @@ impl Values {
     }
 
     /// Probes for applications if a bridge that confirms the newest event is unknown.
-    pub(super) fn look_for_confirmers(&mut self, topic: TopicId) {
-        let confirming = self.topics.get(&topic);
+    pub(super) fn look_for_confirmers(&mut self, at: Handle) {
+        let confirming = self.topics.at(at);
         let confirming = confirming.and_then(|of| of.confirming.as_deref());
         let is_known = |space: &SpaceId| self.confirmers.contains_key(space);
         if confirming.is_some_and(|of| !of.spaces.iter().all(is_known)) {

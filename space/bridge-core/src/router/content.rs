@@ -11,7 +11,8 @@ use uadp::{
     Scalar, StatusCode, Timestamp, Variant,
 };
 
-use super::{About, Values};
+use super::about::About;
+use super::values::Values;
 use crate::base::Base;
 use crate::counters::Reason;
 use crate::layout::Layout;
@@ -19,6 +20,7 @@ use crate::place::Place;
 use crate::settings::Now;
 use crate::takes::Takes;
 use crate::topic::{Role, Topic};
+use crate::topics::Handle;
 
 /// The selection of fields in a message.
 enum Choice {
@@ -88,7 +90,7 @@ impl Values {
     /// Stores a key frame for later delta frames, and returns the selection of its fields.
     pub(super) fn take_base(
         &mut self,
-        topic: TopicId,
+        at: Handle,
         message: &DataSetMessage<'_>,
         place: &Place,
     ) -> Takes {
@@ -96,7 +98,7 @@ impl Values {
             role: Role::Theirs(reader),
             takes,
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.topics.at_mut(at)
         else {
             return Takes::All;
         };
@@ -270,11 +272,7 @@ impl Values {
         out: &mut Vec<u8>,
     ) -> Result<Option<Quality>, Refusal> {
         let no_key_frame = |why: &str| Err((Reason::NoKeyFrame, why.to_owned()));
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
+        let Some(reader) = self.topics.reader_of(topic) else {
             return Ok(None);
         };
         reader.deltas = true;
@@ -313,11 +311,8 @@ impl Values {
     }
 
     /// Removes the key frame of a silent writer that has never sent a delta frame.
-    pub(super) fn forget_base(&mut self, topic: TopicId) {
-        if let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
+    pub(super) fn forget_base(&mut self, at: Handle) {
+        if let Some(reader) = self.topics.reader(at)
             && !reader.deltas
             && let Some(base) = reader.base.take()
         {
@@ -326,21 +321,12 @@ impl Values {
     }
 
     /// Stores a key frame that the local side already has, because delta frames may follow it.
-    pub(super) fn follow_again(
-        &mut self,
-        topic: TopicId,
-        message: &DataSetMessage<'_>,
-        place: &Place,
-    ) {
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
+    pub(super) fn follow_again(&mut self, at: Handle, message: &DataSetMessage<'_>, place: &Place) {
+        let Some(reader) = self.topics.reader(at) else {
             return;
         };
         if reader.deltas {
-            self.take_base(topic, message, place);
+            self.take_base(at, message, place);
         } else if let Some(base) = &mut reader.base {
             base.repeated(place);
         }

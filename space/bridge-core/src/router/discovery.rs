@@ -37,7 +37,8 @@ impl Router {
             return;
         }
         let overflow = description.overflow;
-        let Some(entry) = self.values.follow(topic, None, now) else {
+        let at = self.values.follow(topic, now);
+        let Some(entry) = self.values.topics.at_mut(at) else {
             return;
         };
         entry.said = Some(Box::new(description));

@@ -5,13 +5,14 @@ use std::time::Duration;
 use mappings::TopicId;
 use uadp::Fields;
 
+use super::about::About;
 use super::receive::Sample;
-use super::{About, Values};
+use super::values::Values;
 use crate::counters::Reason;
 use crate::output::Kept;
 use crate::reader::Held;
 use crate::settings::Now;
-use crate::topic::{Role, Topic};
+use crate::topics::Handle;
 
 impl Values {
     /// Stores a sample until its local type is known, in place of the previous sample.
@@ -33,7 +34,7 @@ impl Values {
             return;
         }
         if self.has_room(topic, size) {
-            self.schedule(topic);
+            self.schedule_topic(topic);
             return;
         }
         if let Some(reader_held) = self.held_of(topic) {
@@ -68,13 +69,8 @@ impl Values {
     }
 
     fn held_of(&mut self, topic: TopicId) -> Option<&mut Option<Box<Held>>> {
-        match self.topics.get_mut(&topic) {
-            Some(Topic {
-                role: Role::Theirs(reader),
-                ..
-            }) => Some(&mut reader.held),
-            _ => None,
-        }
+        let reader = self.topics.reader_of(topic)?;
+        Some(&mut reader.held)
     }
 
     /// Removes a large sample if its type was not known in time. A state is received again with its
@@ -89,9 +85,9 @@ impl Values {
 
     /// Delivers a sample that waited for its local type. An event is delivered only until it is too
     /// old.
-    pub(super) fn deliver_held(&mut self, topic: TopicId, held: &Held, now: Now) {
+    pub(super) fn deliver_held(&mut self, at: Handle, held: &Held, now: Now) {
         if !held.lasting && held.until <= now.monotonic {
-            self.came_too_early(topic, held);
+            self.came_too_early(at.topic(), held);
             return;
         }
         let Ok(fields) = Fields::parse(&held.fields) else {
@@ -107,11 +103,13 @@ impl Values {
             // The waiting time is not a delay of this program.
             arrived: now.utc,
         };
-        self.deliver(topic, &sample, now);
+        self.deliver(at, &sample, now);
     }
 
     fn came_too_early(&mut self, topic: TopicId, held: &Held) {
-        self.forget(topic, held.instance);
+        if let Some(reader) = self.topics.reader_of(topic) {
+            reader.forget(held.instance);
+        }
         self.count(About::topic(topic), Reason::NotPublished, 1, || {
             "its local type was known too late for an event".to_owned()
         });

@@ -1,13 +1,12 @@
 //! Metadata of topics of other spaces, from their writers.
 
-use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use mappings::{Mapping, TopicId};
 use uadp::discovery::DataSetMetaDataType;
 
-use super::About;
+use super::about::About;
 use super::values::Values;
 use crate::counters::Reason;
 use crate::description::Described;
@@ -17,6 +16,7 @@ use crate::output::Output;
 use crate::reader::Ask;
 use crate::settings::{Local, Now};
 use crate::topic::{Role, Topic};
+use crate::topics::Topics;
 
 impl Values {
     /// Handles the metadata of a topic of another space. `answered` is called if the metadata is
@@ -70,11 +70,12 @@ impl Values {
                 "there is no room for what more topics consist of".to_owned()
             }),
             News::Other => {
-                let counters = self.topics.get_mut(&topic);
-                let counters = counters.map_or(&mut self.others, |entry| &mut entry.counters);
-                counters.described += 1;
-                if !self.arrange(topic, now) && shape.is_some() {
-                    self.tell_unbound(topic);
+                self.topics.counters(Some(topic)).described += 1;
+                if !self.arrange(topic, now)
+                    && shape.is_some()
+                    && let Some(at) = self.topics.find(topic)
+                {
+                    self.tell_unbound(at);
                 }
             }
         }
@@ -93,10 +94,10 @@ impl Values {
     /// Handles the announcement of a writer that it does not have a topic any more.
     pub(super) fn unlearn(&mut self, topic: TopicId, from: SocketAddr, now: Now) {
         let timeout = self.mapping.pubsub().receive_timeout;
-        if let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
+        let Some(at) = self.topics.find(topic) else {
+            return;
+        };
+        if let Some(reader) = self.topics.reader(at)
             && reader.may_be(from, now.monotonic, timeout)
         {
             let left = reader.leave();
@@ -104,9 +105,9 @@ impl Values {
                 reader.withdraw();
             }
             if left {
-                self.tell_silence(topic);
+                self.tell_silence(at);
             }
-            self.lose(topic, now);
+            self.lose(at, now);
         }
     }
 
@@ -120,11 +121,7 @@ impl Values {
     /// Plans a probe for the fields of a topic if its messages cannot be read without them. The
     /// rate of these probes is limited.
     pub(super) fn ask_layout(&mut self, topic: TopicId, now: Now) {
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
+        let Some(reader) = self.topics.reader_of(topic) else {
             return;
         };
         let before = reader.asked_layout;
@@ -249,11 +246,7 @@ impl Values {
 const ASK_LAYOUT_AGAIN: Duration = Duration::from_secs(10);
 
 /// Returns the precedence of topics when there is no room for all descriptions.
-fn rank(
-    topics: &HashMap<TopicId, Topic>,
-    mapping: &Mapping,
-    now: Instant,
-) -> impl Fn(TopicId) -> Rank {
+fn rank(topics: &Topics, mapping: &Mapping, now: Instant) -> impl Fn(TopicId) -> Rank {
     let timeout = mapping.pubsub().receive_timeout;
     move |topic| match topics.get(&topic).map(|of| &of.role) {
         _ if mapping.variable(topic).is_some() => Rank::Mapped,

@@ -12,6 +12,7 @@ use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::output::Output;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
+use crate::topics::Handle;
 
 impl Router {
     /// Sets the namespaces of the space that only this program writes; initially all. Own topics in
@@ -27,9 +28,9 @@ impl Router {
             .topics
             .iter()
             .filter(|(topic, entry)| {
-                matches!(entry.role, Role::Ours(_)) != self.values.is_home(**topic)
+                matches!(entry.role, Role::Ours(_)) != self.values.is_home(*topic)
             })
-            .map(|(topic, _)| *topic)
+            .map(|(topic, _)| topic)
             .collect();
         for topic in moved {
             self.drop_topic(topic);
@@ -67,43 +68,32 @@ impl Router {
     /// Sends the waiting items of a namespace, and announces its topics and calls. If items were
     /// dropped, the kept values are repeated.
     fn send_again(&mut self, namespace: u16, dropped: bool, now: Now) {
-        let ours = |(topic, entry): (&TopicId, &Topic)| {
+        for at in self.values.topics.handles() {
+            let topic = at.topic();
             let (_, of, _) = topic.triple();
-            (of == namespace && matches!(entry.role, Role::Ours(_))).then_some(*topic)
-        };
-        let topics: Vec<TopicId> = self.values.topics.iter().filter_map(ours).collect();
-        for topic in topics {
-            let Some(entry) = self.values.topics.get_mut(&topic) else {
+            let Some(Topic {
+                role: Role::Ours(writer),
+                announce_at,
+                ..
+            }) = self.values.topics.at_mut(at).filter(|_| of == namespace)
+            else {
                 continue;
             };
-            if let Role::Ours(writer) = &mut entry.role
-                && dropped
-            {
+            if dropped {
                 writer.begin_round(now.monotonic);
             }
-            entry.announce_at = entry.announce_at.map(|_| now.monotonic);
-            if !entry.ready && entry.has_more() {
-                entry.ready = true;
-                self.values.ready.push_back(topic);
-            }
+            *announce_at = announce_at.map(|_| now.monotonic);
+            self.values.resume(at);
             self.announcements
                 .announce_again(&mut self.values, topic, now);
-            self.values.schedule(topic);
+            self.values.schedule(at);
         }
         self.announce_calls(now);
     }
 
-    /// Removes a topic and keeps its counters in total.
+    /// Removes a topic and stops its announcements.
     fn drop_topic(&mut self, topic: TopicId) {
-        let Some(entry) = self.values.topics.remove(&topic) else {
-            return;
-        };
-        self.values.others.absorb(&entry.counters);
-        if let Role::Theirs(reader) = entry.role
-            && let Some(base) = reader.base
-        {
-            self.values.base_bytes = self.values.base_bytes.saturating_sub(base.weight());
-        }
+        self.values.remove(topic);
         self.announcements.forget(&mut self.values, topic);
     }
 }
@@ -134,16 +124,17 @@ impl Values {
 
     /// Keeps the waiting items of a topic while it is unknown whether the namespace is free, or
     /// drops them if it is taken.
-    pub(super) fn withhold(&mut self, topic: TopicId) {
+    pub(super) fn withhold(&mut self, at: Handle) {
+        let topic = at.topic();
         let (_, namespace, _) = topic.triple();
         let is_taken = self.claims.is_taken(namespace);
-        let Some(entry) = self.topics.get_mut(&topic) else {
+        let Some(entry) = self.topics.at_mut(at) else {
             return;
         };
         entry.ready = false;
         if is_taken {
             let mut dropped = u64::from(entry.sending.take().is_some());
-            while entry.take(&mut self.spare).is_some() {
+            while entry.take(&mut self.buffers).is_some() {
                 dropped += 1;
             }
             self.count(

@@ -9,7 +9,7 @@ use uadp::{
     ReassemblyLimits,
 };
 
-use super::About;
+use super::about::About;
 use super::values::Values;
 use crate::counters::Reason;
 use crate::network::number_of;

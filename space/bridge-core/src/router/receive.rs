@@ -11,18 +11,21 @@ use uadp::{
 
 use super::content::Quality;
 use super::redundant::precedes;
-use super::{About, Crossing, Router, Values, late};
+use super::{About, Router, Values};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
 use crate::fields;
 use crate::hops::Hop;
+use crate::late;
 use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::network::number_of;
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
 use crate::reader::{Admitted, Handling};
 use crate::settings::{Local, Now};
+use crate::tap::Crossing;
 use crate::topic::{Item, Role, Topic};
+use crate::topics::Handle;
 
 impl Router {
     /// Handles a datagram from the UA side. The values of its messages are queued, and errors are
@@ -216,7 +219,7 @@ impl Values {
             topic: Some(topic),
             from: Some(from),
         };
-        self.note(topic, || Crossing::Received {
+        self.tap.note(topic, || Crossing::Received {
             from,
             sequence: message.sequence_number(),
             keep_alive: message.kind == MessageKind::KeepAlive,
@@ -233,6 +236,9 @@ impl Values {
         let local = self.settings.local;
         let relay = self.relay;
         let took_over = self.took_over();
+        let Some(at) = self.entry(topic, from, now) else {
+            return;
+        };
         let Some(Topic {
             role: Role::Theirs(reader),
             counters,
@@ -240,7 +246,7 @@ impl Values {
             held_back,
             confirming,
             ..
-        }) = self.entry(topic, from, now)
+        }) = self.topics.at_mut(at)
         else {
             return;
         };
@@ -278,7 +284,7 @@ impl Values {
             Some(Err(Reason::Repeat)) => reader.is_good(now.monotonic),
             Some(_) => false,
         };
-        self.follow_up(topic, (returned, changed), now);
+        self.follow_up(at, (returned, changed), now);
         if let Some(instance) = withdrawn {
             self.tell(Output::Retired { topic, instance });
         }
@@ -289,39 +295,40 @@ impl Values {
             None => {}
             Some(Err(reason)) => {
                 if reason == Reason::Repeat {
-                    self.follow_again(topic, message, &place);
+                    self.follow_again(at, message, &place);
                 }
                 self.count(about, reason, 1, String::new);
             }
-            Some(Ok(admitted)) => self.take_in(topic, message, (&place, &admitted, sent), now),
+            Some(Ok(admitted)) => self.take_in(at, message, (&place, &admitted, sent), now),
         }
     }
 
     /// Carries out the consequences of a message for its topic: the end of a silence, and a probe
     /// for a changed description.
-    fn follow_up(&mut self, topic: TopicId, (returned, changed): (bool, bool), now: Now) {
+    fn follow_up(&mut self, at: Handle, (returned, changed): (bool, bool), now: Now) {
         if returned {
-            self.tell_returned(topic);
+            self.tell_returned(at);
         }
         if changed {
-            self.ask_what(topic);
+            self.ask_what(at.topic());
         }
-        self.retire(topic, now);
-        let entry = self.topics.get(&topic);
+        self.retire(at, now);
+        let entry = self.topics.at(at);
         if entry.is_some_and(|entry| entry.timer.is_none()) {
             // The port created the topic before its writer was received.
-            self.schedule(topic);
+            self.schedule(at);
         }
     }
 
     /// Processes the fields of a message that was admitted to the sequence.
     fn take_in(
         &mut self,
-        topic: TopicId,
+        at: Handle,
         message: &DataSetMessage<'_>,
         (place, admitted, sent): (&Place, &Admitted, Option<Timestamp>),
         now: Now,
     ) {
+        let topic = at.topic();
         let status = message.header().status.unwrap_or_default();
         let sample = |fields, quality: Quality| Sample {
             fields,
@@ -332,11 +339,11 @@ impl Values {
             status: quality.status(status),
             arrived: now.utc,
         };
-        let takes = self.take_base(topic, message, place);
+        let takes = self.take_base(at, message, place);
         match Self::plain(message, takes) {
             Some(Ok(fields)) => {
                 self.record_way(place, sent, now);
-                self.route(topic, &sample(fields, Quality::default()), now);
+                self.route(at, &sample(fields, Quality::default()), now);
                 return;
             }
             Some(Err(error)) => {
@@ -352,13 +359,13 @@ impl Values {
                 match message.and_then(|message| message.fields()) {
                     Ok(fields) => {
                         self.record_way(place, sent, now);
-                        self.route(topic, &sample(fields, quality), now);
+                        self.route(at, &sample(fields, quality), now);
                     }
                     Err(error) => self.drop_undecoded(Some(topic), place.from, &error),
                 }
             }
             Ok(None) => {
-                self.lives(topic, now);
+                self.lives(at, now);
                 self.count(About::topic(topic), Reason::Repeat, 1, String::new);
             }
             Err(refusal) => self.refuse_content(topic, place.from, refusal, now),
@@ -367,43 +374,37 @@ impl Values {
     }
 
     /// Records that the topic has a good value.
-    pub(super) fn is_good(&mut self, topic: TopicId, now: Now) {
-        if let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
+    pub(super) fn is_good(&mut self, at: Handle, now: Now) {
+        if let Some(reader) = self.topics.reader(at)
             && reader.is_good(now.monotonic)
         {
-            self.tell_returned(topic);
+            self.tell_returned(at);
         }
     }
 
     /// Records a message of the writer without a new value.
-    fn lives(&mut self, topic: TopicId, now: Now) {
-        if let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
+    fn lives(&mut self, at: Handle, now: Now) {
+        if let Some(reader) = self.topics.reader(at)
             && reader.lives(now.monotonic)
         {
-            self.tell_returned(topic);
+            self.tell_returned(at);
         }
     }
 
     /// Reports the end of the silence of a topic.
-    pub(super) fn tell_returned(&mut self, topic: TopicId) {
-        self.tell_silence(topic);
-        self.schedule(topic);
+    pub(super) fn tell_returned(&mut self, at: Handle) {
+        self.tell_silence(at);
+        self.schedule(at);
     }
 
     /// Delivers a sample, or holds it until its local type is known.
-    fn route(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
+    fn route(&mut self, at: Handle, sample: &Sample<'_>, now: Now) {
         let typed = self.settings.local == Local::Fields;
         let Some(Topic {
             role: Role::Theirs(reader),
             plan,
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.topics.at_mut(at)
         else {
             return;
         };
@@ -416,9 +417,9 @@ impl Values {
         if typed || plan.is_some() {
             // Checked once for each shape instead of for each sample.
             if anew {
-                self.tell_described(topic);
+                self.tell_described(at);
             }
-            self.deliver(topic, sample, now);
+            self.deliver(at, sample, now);
             return;
         }
         let asks = reader
@@ -427,22 +428,18 @@ impl Values {
         if asks {
             reader.asked = Some(now.monotonic);
         }
-        self.hold(topic, sample, now);
+        self.hold(at.topic(), sample, now);
         if asks {
-            self.tell_unbound(topic);
+            self.tell_unbound(at);
         }
         // Not a loss yet, because the newest sample waits. It is not logged, because the port
         // reports topics without a type.
-        self.is_good(topic, now);
-        self.count(About::topic(topic), Reason::Untyped, 1, String::new);
+        self.is_good(at, now);
+        self.count(About::topic(at.topic()), Reason::Untyped, 1, String::new);
     }
 
-    pub(super) fn deliver(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
+    pub(super) fn deliver(&mut self, at: Handle, sample: &Sample<'_>, now: Now) {
+        let Some(reader) = self.topics.reader(at) else {
             return;
         };
         let evicted = reader.delivered(
@@ -451,7 +448,10 @@ impl Values {
             now.monotonic,
         );
         if let Some(instance) = evicted {
-            self.tell(Output::Retired { topic, instance });
+            self.tell(Output::Retired {
+                topic: at.topic(),
+                instance,
+            });
         }
         let mut payload = self.buffer();
         let Some(Topic {
@@ -459,14 +459,14 @@ impl Values {
             transcoder,
             by_name,
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.topics.at_mut(at)
         else {
             return;
         };
         let mut scratch = None;
         let written = match (plan, transcoder.as_deref()) {
             (Some(_), Some(Ok(transcoder))) => {
-                let scratch = scratch.insert(self.spare.pop().unwrap_or_default());
+                let scratch = scratch.insert(self.buffers.take());
                 transcoder.run(sample.fields.clone(), scratch, &mut payload)
             }
             (Some(_), Some(Err(why))) => Err((Reason::Mismatch.into(), why.clone())),
@@ -482,8 +482,8 @@ impl Values {
         if let Err((cause, detail)) = written {
             self.recycle(payload);
             // The local side does not have the value, so its repetition must be delivered.
-            self.forget(topic, sample.instance);
-            self.count(About::topic(topic), cause, 1, || detail);
+            self.forget(at, sample.instance);
+            self.count(About::topic(at.topic()), cause, 1, || detail);
             return;
         }
         let Sample {
@@ -495,18 +495,18 @@ impl Values {
             arrived,
             ..
         } = *sample;
-        let loss = self.topics.get_mut(&topic).and_then(|of| of.loss.as_mut());
+        let loss = self.topics.at_mut(at).and_then(|of| of.loss.as_mut());
         let holds = loss.is_some_and(|loss| {
             loss.deliver(now.monotonic);
             loss.due().is_some()
         });
         if holds {
-            self.schedule(topic);
+            self.schedule(at);
         }
         self.push(
-            topic,
+            at,
             Item::Delivery(Delivery {
-                topic,
+                topic: at.topic(),
                 payload,
                 source,
                 status,
@@ -519,23 +519,22 @@ impl Values {
     }
 
     /// Reports values that are not repeated any more beside others.
-    fn retire(&mut self, topic: TopicId, now: Now) {
+    fn retire(&mut self, at: Handle, now: Now) {
         let after = self
             .mapping
             .pubsub()
             .key_frame_period
             .saturating_mul(MISSED_ROUNDS);
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
+        let Some(reader) = self.topics.reader(at) else {
             return;
         };
         let gone: Vec<Timestamp> =
             std::iter::from_fn(|| reader.retire(now.monotonic, after)).collect();
         for instance in gone {
-            self.tell(Output::Retired { topic, instance });
+            self.tell(Output::Retired {
+                topic: at.topic(),
+                instance,
+            });
         }
     }
 

@@ -18,6 +18,7 @@ use crate::place::Place;
 use crate::redundancy::{Heartbeat, Rank, Redundancy, RoleChange, SwitchRefusal};
 use crate::settings::Now;
 use crate::topic::{Item, Role, Topic};
+use crate::topics::Handle;
 use crate::writer::{MAX_KEPT, Message};
 
 /// The redundancy of the own space.
@@ -343,11 +344,7 @@ impl Router {
     /// Continues with the sequence number and the time of the active bridge.
     fn follow_number(&mut self, topic: TopicId, next: u16, stamp: Option<Timestamp>) {
         // Topics of unknown names are not created: any sender in the group can invent names.
-        if let Some(Topic {
-            role: Role::Ours(writer),
-            ..
-        }) = self.values.topics.get_mut(&topic)
-        {
+        if let Some(writer) = self.values.topics.writer_of(topic) {
             writer.follow(next, stamp);
         }
     }
@@ -394,11 +391,7 @@ impl Values {
         let Some(redundant) = &mut self.redundant else {
             return;
         };
-        let Some(Topic {
-            role: Role::Ours(writer),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
+        let Some(writer) = self.topics.writer_of(topic) else {
             return;
         };
         if let Some(followed) = redundant.followed.get(&topic)
@@ -446,7 +439,9 @@ impl Values {
     pub(super) fn mute_delivery(&mut self, delivery: Delivery, now: Now) {
         let topic = delivery.topic;
         // The local side has the value from the active bridge.
-        self.is_good(topic, now);
+        if let Some(at) = self.topics.find(topic) {
+            self.is_good(at, now);
+        }
         let Some(redundant) = &mut self.redundant else {
             return;
         };
@@ -532,9 +527,8 @@ impl Router {
             redundant.unsure.clear();
             redundant.took_over = None;
         }
-        let topics: Vec<TopicId> = self.values.topics.keys().copied().collect();
-        for topic in topics {
-            self.values.mute_topic(topic, now);
+        for at in self.values.topics.handles() {
+            self.values.mute_topic(at.topic(), now);
         }
         self.values.paced.clear();
         // A heartbeat that was made before is outdated.
@@ -579,9 +573,9 @@ impl Router {
     /// Continues where the former active bridge ended. `gap` is the time since its last heartbeat.
     fn unmute(&mut self, gap: Option<Duration>, now: Now) {
         // The former active bridge may have sent or published what waits since the last output.
-        let topics: Vec<TopicId> = self.values.topics.keys().copied().collect();
-        for topic in &topics {
-            self.values.empty_topic(*topic, now);
+        let topics = self.values.topics.handles();
+        for at in &topics {
+            self.values.empty_topic(at.topic(), now);
         }
         let Some(redundant) = &mut self.values.redundant else {
             return;
@@ -599,8 +593,8 @@ impl Router {
             self.values
                 .count_only(About::topic(topic), cause, count, String::new);
         }
-        for topic in topics {
-            self.continue_own(topic, now);
+        for at in topics {
+            self.continue_own(at, now);
         }
         for (topic, states) in held {
             for HeldState { at, mut delivery } in states {
@@ -608,13 +602,13 @@ impl Router {
                     // The former active bridge has published it: it is for late joiners only.
                     delivery.kept = Kept::Again;
                 }
-                self.values.push(topic, Item::Delivery(delivery));
+                self.values.push_to(topic, Item::Delivery(delivery));
             }
         }
         for (topic, (at, delivery)) in losses {
             if is_unsure(at) {
                 self.values.tell(Output::CommanderLost { topic });
-                self.values.push(topic, Item::Delivery(delivery));
+                self.values.push_to(topic, Item::Delivery(delivery));
             } else {
                 self.values.recycle(delivery.payload);
             }
@@ -624,7 +618,7 @@ impl Router {
     }
 
     /// Continues the sequence numbers of an own topic, and repeats its state.
-    fn continue_own(&mut self, topic: TopicId, now: Now) {
+    fn continue_own(&mut self, at: Handle, now: Now) {
         let Some(Topic {
             role: Role::Ours(writer),
             queue,
@@ -633,7 +627,7 @@ impl Router {
             announce_at,
             ready,
             ..
-        }) = self.values.topics.get_mut(&topic)
+        }) = self.values.topics.at_mut(at)
         else {
             return;
         };
@@ -651,15 +645,15 @@ impl Router {
         let repeats = writer.repeats();
         if repeats && !*ready {
             *ready = true;
-            self.values.ready.push_back(topic);
+            self.values.ready.push_back(at);
         }
         if let Some((outdated, _)) = outdated {
             self.values.recycle(outdated.bytes);
             let cause = (Reason::Takeover, "gap");
             self.values
-                .count_only(About::topic(topic), cause, 1, String::new);
+                .count_only(About::topic(at.topic()), cause, 1, String::new);
         }
-        self.values.schedule(topic);
+        self.values.schedule(at);
     }
 }
 

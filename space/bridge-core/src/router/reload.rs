@@ -37,8 +37,8 @@ impl Router {
             calls.set_receive_timeout(receive_timeout);
         }
         let renamed = before.namespaces() != self.values.mapping.namespaces();
-        let topics: Vec<TopicId> = self.values.topics.keys().copied().collect();
-        for topic in topics {
+        for at in self.values.topics.handles() {
+            let topic = at.topic();
             let rules = |mapping: &Mapping| {
                 let variable = mapping.variable(topic);
                 variable
@@ -79,7 +79,7 @@ impl Router {
                 self.describe_again(topic, now);
             }
             // The new mapping may have shorter periods.
-            self.values.schedule(topic);
+            self.values.schedule(at);
         }
         self.inquire(now);
     }
@@ -184,24 +184,26 @@ impl Values {
         self.settle_arrival(topic);
         let waiting: Vec<Item> = std::iter::from_fn(|| before.pop()).collect();
         for item in waiting {
-            // `push` counts dropped items itself.
-            let _gave_way = self.push(topic, item);
+            self.push_to(topic, item);
         }
     }
 
     /// Replaces the publishing rule of a topic. A held sample is sent.
     fn regate(&mut self, topic: TopicId, now: Now) {
+        let Some(at) = self.topics.find(topic) else {
+            return;
+        };
         let Some(Topic {
             role: Role::Ours(_),
             gate,
             ..
-        }) = self.topics.get_mut(&topic)
+        }) = self.topics.at_mut(at)
         else {
             return;
         };
         let held = gate.as_mut().and_then(|gate| gate.hurry(now.monotonic));
         let rule = self.mapping.variable(topic).map(|v| v.publish);
         *gate = Gate::new(rule.unwrap_or_default());
-        self.let_go(topic, held, now);
+        self.let_go(at, held, now);
     }
 }

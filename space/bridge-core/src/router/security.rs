@@ -5,7 +5,7 @@ use std::time::Instant;
 use mappings::SecurityGroup;
 use uadp::{KeyError, NetworkMessage, NetworkMessageType};
 
-use super::About;
+use super::about::About;
 use super::values::Values;
 use crate::guard::{GroupState, Guard, KeyDelivery, Unopened};
 use crate::output::Output;

@@ -2,12 +2,14 @@
 
 use mappings::TopicId;
 
-use super::{About, Crossing, Router, Values};
+use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::network::chunk;
 use crate::output::Output;
 use crate::settings::Now;
+use crate::tap::Crossing;
 use crate::topic::{Item, Role, Sending};
+use crate::topics::Handle;
 use crate::writer::Message;
 
 impl Router {
@@ -107,12 +109,12 @@ impl Values {
         if !self.paced.is_empty() && self.pace.is_open(now.monotonic) {
             self.ready.extend(self.paced.pop_front());
         }
-        while let Some(topic) = self.ready.pop_front() {
-            if let Some(news) = self.news_of(topic, now) {
-                self.ready.push_front(topic);
+        while let Some(at) = self.ready.pop_front() {
+            if let Some(news) = self.news_of(at, now) {
+                self.ready.push_front(at);
                 return Some(news);
             }
-            if let Some(output) = self.take_turn(topic, now) {
+            if let Some(output) = self.take_turn(at, now) {
                 return Some(output);
             }
         }
@@ -120,19 +122,19 @@ impl Values {
     }
 
     /// Takes an item of a topic, and requeues the topic if it has more items.
-    fn take_turn(&mut self, topic: TopicId, now: Now) -> Option<Output> {
-        if !self.claims.is_empty() && self.is_withheld(topic) {
-            self.withhold(topic);
+    fn take_turn(&mut self, at: Handle, now: Now) -> Option<Output> {
+        if !self.claims.is_empty() && self.is_withheld(at.topic()) {
+            self.withhold(at);
             return None;
         }
-        if self.redundant.is_some() && self.mute_topic(topic, now) {
+        if self.redundant.is_some() && self.mute_topic(at.topic(), now) {
             return None;
         }
-        let entry = self.topics.get_mut(&topic)?;
+        let entry = self.topics.at_mut(at)?;
         let repeated = entry.counters.repeated;
         let item = match entry.sending {
             Some(_) => None,
-            None => entry.take(&mut self.spare),
+            None => entry.take(&mut self.buffers),
         };
         let (datagram, delivery) = match item {
             Some(Item::Message(Message::Datagram(datagram))) => {
@@ -145,39 +147,40 @@ impl Values {
             }
             Some(Item::Message(Message::Large(message))) => {
                 entry.sending = Some(Sending { message, offset: 0 });
-                return self.send_chunk(topic, now);
+                return self.send_chunk(at, now);
             }
-            None if entry.sending.is_some() => return self.send_chunk(topic, now),
+            None if entry.sending.is_some() => return self.send_chunk(at, now),
             None => (None, None),
         };
         let repeated = entry.counters.repeated != repeated;
         entry.ready = entry.has_more();
         if entry.ready {
-            self.ready.push_back(topic);
+            self.ready.push_back(at);
         }
         if datagram.is_some() {
-            self.note(topic, || Crossing::Sent { repeated });
+            self.tap.note(at.topic(), || Crossing::Sent { repeated });
         }
         match datagram {
-            Some(datagram) => self.datagram(topic, datagram, now),
+            Some(datagram) => self.datagram(at, datagram, now),
             None => delivery.map(Output::Delivery),
         }
     }
 
     /// Returns the next chunk of the topic's large message, if the pace allows it.
-    fn send_chunk(&mut self, topic: TopicId, now: Now) -> Option<Output> {
+    fn send_chunk(&mut self, at: Handle, now: Now) -> Option<Output> {
         if !self.pace.is_open(now.monotonic) {
-            self.paced.push_back(topic);
+            self.paced.push_back(at);
             return None;
         }
+        let topic = at.topic();
         let (max_datagram, _) = self.sizes();
         let mut bytes = self.buffer();
-        let keeps_time = self.keeps_time(topic);
-        let entry = self.topics.get_mut(&topic)?;
+        let keeps_time = self.keeps_time(at);
+        let entry = self.topics.at_mut(at)?;
         let Sending { message, offset } = entry.sending.take()?;
         let first = message.time().filter(|_| keeps_time);
-        let at = first.unwrap_or(now.utc);
-        let written = chunk(&mut bytes, topic, (&message, offset), max_datagram, at);
+        let time = first.unwrap_or(now.utc);
+        let written = chunk(&mut bytes, topic, (&message, offset), max_datagram, time);
         if let Ok(offset) = written {
             if offset < message.data_set_message().len() {
                 entry.sending = Some(Sending { message, offset });
@@ -191,10 +194,10 @@ impl Values {
         }
         entry.ready = entry.has_more();
         if entry.ready {
-            self.ready.push_back(topic);
+            self.ready.push_back(at);
         }
         if is_whole && written.is_ok() {
-            self.note(topic, || Crossing::Sent { repeated: false });
+            self.tap.note(topic, || Crossing::Sent { repeated: false });
         }
         match written {
             Ok(_) => {

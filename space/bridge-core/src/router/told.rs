@@ -1,15 +1,12 @@
 //! Outputs other than samples: drops to log, and notifications about topics of other spaces.
 
-use std::net::SocketAddr;
-
-use mappings::TopicId;
-
-use super::Values;
+use super::about::About;
+use super::values::Values;
 use crate::counters::{Cause, Reason, is_told};
 use crate::output::{Notice, Output};
-use crate::reader::Ask;
+use crate::reader::{Ask, Reader};
 use crate::settings::Now;
-use crate::topic::{Role, Topic};
+use crate::topics::Handle;
 
 impl Values {
     /// Counts drops, and reports them at the 1st, 10th, 100th ... occurrence of their cause.
@@ -21,9 +18,7 @@ impl Values {
         detail: impl FnOnce() -> String,
     ) {
         let cause = cause.into();
-        if let Some(entry) = topic.and_then(|topic| self.topics.get_mut(&topic))
-            && let Role::Theirs(reader) = &mut entry.role
-        {
+        if let Some(reader) = topic.and_then(|topic| self.topics.reader_of(topic)) {
             reader.dropped(cause.reason);
         }
         self.count_only(About { topic, from }, cause, count, detail);
@@ -38,15 +33,11 @@ impl Values {
         detail: impl FnOnce() -> String,
     ) {
         let cause = cause.into();
-        let counters = match topic.and_then(|topic| self.topics.get_mut(&topic)) {
-            Some(entry) => &mut entry.counters,
-            None => &mut self.others,
-        };
-        let total = counters.add(cause, count);
+        let total = self.topics.counters(topic).add(cause, count);
         let before = total.saturating_sub(count);
-        if let Some(topic) = topic.filter(|topic| self.taps(*topic)) {
+        if let Some(topic) = topic.filter(|topic| self.tap.taps(*topic)) {
             let detail = detail();
-            self.note_drop((topic, from), cause, (count, &detail));
+            self.tap.note_drop((topic, from), cause, (count, &detail));
             let about = About {
                 topic: Some(topic),
                 from,
@@ -86,55 +77,47 @@ impl Values {
         if self.told.len() < MAX_TOLD {
             self.told.push_back(output);
         } else {
-            self.others.add((Reason::Overflow, "told"), 1);
+            self.topics.others_mut().add((Reason::Overflow, "told"), 1);
         }
     }
 
     /// Notifies the port that the silence of a topic has changed. The notification contains the
     /// state at the time of its output.
-    pub(super) fn tell_silence(&mut self, topic: TopicId) {
-        self.tell_of(topic, |reader| reader.news.silence = true);
+    pub(super) fn tell_silence(&mut self, at: Handle) {
+        self.tell_of(at, |reader| reader.news.silence = true);
     }
 
     /// Requests the local type of a topic from the port, with the description known at the time of
     /// output. A pending request is not repeated.
-    pub(super) fn tell_unbound(&mut self, topic: TopicId) {
-        self.tell_of(topic, |reader| reader.news.ask = Some(Ask::Always));
+    pub(super) fn tell_unbound(&mut self, at: Handle) {
+        self.tell_of(at, |reader| reader.news.ask = Some(Ask::Always));
     }
 
     /// Requests a check of the writer's description from the port, because the values of an open
     /// topic may have changed.
-    pub(super) fn tell_described(&mut self, topic: TopicId) {
-        self.tell_of(topic, |reader| {
+    pub(super) fn tell_described(&mut self, at: Handle) {
+        self.tell_of(at, |reader| {
             reader.news.ask.get_or_insert(Ask::IfDescribed);
         });
     }
 
-    fn tell_of(&mut self, topic: TopicId, news: impl FnOnce(&mut crate::reader::Reader)) {
-        if let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        {
+    fn tell_of(&mut self, at: Handle, news: impl FnOnce(&mut Reader)) {
+        if let Some(reader) = self.topics.reader(at) {
             news(reader);
             if !std::mem::replace(&mut reader.news.queued, true) {
-                self.news.push_back(topic);
+                self.news.push_back(at);
             }
         }
     }
 
     /// Returns the next notification about any topic.
     pub(super) fn next_news(&mut self, now: Now) -> Option<Output> {
-        while let Some(topic) = self.news.front().copied() {
-            if let Some(told) = self.news_of(topic, now) {
+        while let Some(at) = self.news.front().copied() {
+            if let Some(told) = self.news_of(at, now) {
                 return Some(told);
             }
             self.news.pop_front();
-            if let Some(Topic {
-                role: Role::Theirs(reader),
-                ..
-            }) = self.topics.get_mut(&topic)
-            {
+            if let Some(reader) = self.topics.reader(at) {
                 reader.news.queued = false;
             }
         }
@@ -142,14 +125,9 @@ impl Values {
     }
 
     /// Returns the next notification about a topic, which precedes its values.
-    pub(super) fn news_of(&mut self, topic: TopicId, now: Now) -> Option<Output> {
-        let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
-            return None;
-        };
+    pub(super) fn news_of(&mut self, at: Handle, now: Now) -> Option<Output> {
+        let topic = at.topic();
+        let reader = self.topics.reader(at)?;
         if std::mem::take(&mut reader.news.silence) {
             let silent = reader.is_silent();
             return Some(Output::Silent {
@@ -165,34 +143,6 @@ impl Values {
             return None;
         };
         self.asked(topic, ask, shape, now)
-    }
-}
-
-/// The topic and sender of a drop.
-#[derive(Clone, Copy)]
-pub(super) struct About {
-    pub(super) topic: Option<TopicId>,
-    pub(super) from: Option<SocketAddr>,
-}
-
-impl About {
-    pub(super) const NOTHING: Self = Self {
-        topic: None,
-        from: None,
-    };
-
-    pub(super) const fn topic(topic: TopicId) -> Self {
-        Self {
-            topic: Some(topic),
-            from: None,
-        }
-    }
-
-    pub(super) const fn sender(from: SocketAddr) -> Self {
-        Self {
-            topic: None,
-            from: Some(from),
-        }
     }
 }
 

@@ -1,30 +1,37 @@
 //! The values of topics on their way through the program.
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BinaryHeap, HashMap, VecDeque};
+use std::collections::{BTreeMap, BinaryHeap, VecDeque};
 use std::sync::Arc;
 use std::time::Instant;
 
-use mappings::{Mapping, SpaceId, TopicId};
+use mappings::{Mapping, Overflow, SpaceId, TopicId};
+use messages::{Dialect, MessageType, PlanError, Selection, Wire};
+use uadp::Timestamp;
 
+use super::about::About;
 use super::claims::Claims;
-use super::follow::MAX_STRAYS;
 use super::inquiries::Inquiries;
 use super::redundant::Redundant;
-use super::tap::Tap;
+use crate::buffers::Buffers;
 use crate::confirm::Confirmer;
-use crate::counters::Counters;
+use crate::counters::Reason;
 use crate::description::Described;
 use crate::hops::Hops;
 use crate::layout::Layout;
 use crate::learned::Learned;
 use crate::loop_rule::Owned;
-use crate::output::Output;
+use crate::loss::{Loss, Stop, trigger};
+use crate::output::{Delivery, Output};
 use crate::pace::Pace;
 use crate::plans::Plans;
 use crate::room::Room;
-use crate::settings::{Relay, Settings};
-use crate::topic::Topic;
+use crate::settings::{Local, Now, Relay, Settings};
+use crate::tap::Tap;
+use crate::topic::{Item, Role};
+use crate::topics::{Handle, Topics};
+use crate::transcoder::Transcoder;
+use crate::writer::{Encoded, Message};
 
 /// The topics of the space with their queues, turns and timers, and the outputs about them.
 #[derive(Debug)]
@@ -32,15 +39,15 @@ pub(super) struct Values {
     pub(super) settings: Settings,
     pub(super) owned: Owned,
     pub(super) mapping: Arc<Mapping>,
-    pub(super) topics: HashMap<TopicId, Topic>,
+    pub(super) topics: Topics,
     /// The limit for topics that are unknown to the mapping and the local side.
     pub(super) room: Room,
     pub(super) plans: Plans,
     /// Topics with items to poll, served in turn, so that a topic with large messages does not
     /// block a topic with small messages.
-    pub(super) ready: VecDeque<TopicId>,
+    pub(super) ready: VecDeque<Handle>,
     /// Topics with a partly sent large message, which wait for `pace`.
-    pub(super) paced: VecDeque<TopicId>,
+    pub(super) paced: VecDeque<Handle>,
     pub(super) pace: Pace,
     pub(super) claims: Claims,
     /// The redundancy of the own space; `None` without redundancy.
@@ -62,20 +69,16 @@ pub(super) struct Values {
     /// Outputs other than samples and calls.
     pub(super) told: VecDeque<Output>,
     /// Topics of other spaces with notifications for the port, without duplicates.
-    pub(super) news: VecDeque<TopicId>,
+    pub(super) news: VecDeque<Handle>,
     /// Whether `news` is polled before `ready` next time.
     pub(super) news_first: bool,
-    pub(super) timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
+    pub(super) timers: BinaryHeap<Reverse<(Instant, Handle)>>,
     /// The size in bytes of the key frames stored for delta frames.
     pub(super) base_bytes: usize,
     /// Topics with a large sample that may wait for its local type.
     pub(super) large_held: Vec<TopicId>,
-    /// The tapped topics; `None` without tapped topics.
-    pub(super) tap: Option<Box<Tap>>,
-    /// Buffers for reuse.
-    pub(super) spare: Vec<Vec<u8>>,
-    /// Counters of datagrams and messages without a topic, and of removed topics.
-    pub(super) others: Counters,
+    pub(super) tap: Tap,
+    pub(super) buffers: Buffers,
     pub(super) hops: Hops,
 }
 
@@ -85,7 +88,7 @@ impl Values {
             settings,
             owned: Owned::All,
             mapping,
-            topics: HashMap::new(),
+            topics: Topics::default(),
             room: Room::new(MAX_STRAYS),
             plans: Plans::default(),
             ready: VecDeque::new(),
@@ -106,10 +109,162 @@ impl Values {
             timers: BinaryHeap::new(),
             base_bytes: 0,
             large_held: Vec::new(),
-            tap: None,
-            spare: Vec::new(),
-            others: Counters::default(),
+            tap: Tap::default(),
+            buffers: Buffers::default(),
             hops: Hops::new(),
         }
     }
+
+    /// Binds a topic as [`Router::bind`] does. Returns whether it is a topic of the own space,
+    /// which is announced with its type.
+    pub(super) fn bind_type(
+        &mut self,
+        topic: TopicId,
+        (message_type, selection): (&Arc<MessageType>, &Selection),
+        now: Now,
+    ) -> Result<bool, PlanError> {
+        let wire = match self.settings.local {
+            Local::Ros1 => Wire::Ros1,
+            Local::Cdr => Wire::Cdr,
+            // A local side with fields as payload needs no plan.
+            Local::Fields => return Ok(false),
+        };
+        let plan = self.plans.plan(message_type, selection, wire)?;
+        let reactions = self.reactions(topic, (message_type, selection), wire)?;
+        // A message as bytes has the encoding of its origin. Bytes from an OPC UA origin are used
+        // without conversion.
+        let origin = match topic.space {
+            SpaceId::UA => None,
+            space if space.is_ros2() => Some(Dialect::Ros2),
+            _ => Some(Dialect::Ros1),
+        };
+        let transcoder = origin
+            .filter(|origin| *selection == Selection::Bytes && *origin != message_type.dialect())
+            .map(|origin| {
+                let (_, namespace, _) = topic.triple();
+                Box::new(Transcoder::compile(origin, message_type, namespace))
+            });
+        let at = self.follow(topic, now);
+        let Some(entry) = self.topics.at_mut(at) else {
+            return Ok(false);
+        };
+        entry.plan = Some(plan);
+        entry.transcoder = transcoder;
+        entry.bound = Some(Box::new((Arc::clone(message_type), selection.clone())));
+        entry.react(reactions);
+        let Role::Theirs(reader) = &mut entry.role else {
+            return Ok(true);
+        };
+        reader.forget_all();
+        let held = reader.held.take();
+        self.drop_deliveries(topic, "its local type is another now");
+        if let Some(held) = held {
+            self.deliver_held(at, &held, now);
+        }
+        Ok(false)
+    }
+
+    /// Returns the reactions of a topic of another space to the loss of a commander.
+    pub(super) fn reactions(
+        &self,
+        topic: TopicId,
+        of: (&Arc<MessageType>, &Selection),
+        wire: Wire,
+    ) -> Result<(Option<Loss>, Option<Stop>), PlanError> {
+        if self.is_home(topic) {
+            return Ok((None, None));
+        }
+        let loss = Loss::new(&self.mapping, topic, of, wire)?;
+        Ok((loss, trigger(&self.mapping, topic, of.0, wire)?))
+    }
+
+    /// Queues an item. Returns whether older items were dropped for it.
+    pub(super) fn push(&mut self, at: Handle, item: Item) -> bool {
+        let Some(entry) = self.topics.at_mut(at) else {
+            return false;
+        };
+        let bytes = item.bytes();
+        let keeps_latest = entry.overflow == Overflow::KeepLatest;
+        let dropped = entry.queue.push(item, bytes);
+        if !entry.ready {
+            entry.ready = true;
+            self.ready.push_back(at);
+        }
+        if dropped.is_empty() {
+            return false;
+        }
+        let topic = at.topic();
+        let count = dropped.len().try_into().unwrap_or(u64::MAX);
+        for item in dropped {
+            match item {
+                Item::Message(Message::Datagram(Encoded { bytes, .. })) => self.recycle(bytes),
+                // The message is kept for repetition, or freed with its last reference.
+                Item::Message(Message::Large(_)) => {}
+                Item::Delivery(Delivery {
+                    payload, instance, ..
+                }) => {
+                    self.recycle(payload);
+                    self.forget(at, instance);
+                }
+            }
+        }
+        let reason = match keeps_latest && self.is_withheld(topic) {
+            true => Reason::Outpaced,
+            false => Reason::Overflow,
+        };
+        self.count(About::topic(topic), reason, count, || {
+            "the queue was full, its oldest sample was dropped".to_owned()
+        });
+        true
+    }
+
+    /// Queues an item of a topic by its name.
+    pub(super) fn push_to(&mut self, topic: TopicId, item: Item) {
+        if let Some(at) = self.topics.find(topic) {
+            // `push` counts dropped items itself.
+            let _gave_way = self.push(at, item);
+        }
+    }
+
+    /// Records that a value was not delivered.
+    pub(super) fn forget(&mut self, at: Handle, instance: Option<Timestamp>) {
+        if let Some(reader) = self.topics.reader(at) {
+            reader.forget(instance);
+        }
+    }
+
+    /// Returns the maximum sizes of a datagram and of a message in bytes.
+    pub(super) fn sizes(&self) -> (u16, u32) {
+        let pubsub = self.mapping.pubsub();
+        let room = u16::try_from(self.overhead).unwrap_or_default();
+        let limit = self.relay.and_then(|relay| relay.limit);
+        let most = limit.map_or(pubsub.max_datagram, |limit| limit.min(pubsub.max_datagram));
+        let max_datagram = most.saturating_sub(room);
+        (max_datagram, pubsub.max_message)
+    }
+
+    /// Returns an empty buffer.
+    pub(super) fn buffer(&mut self) -> Vec<u8> {
+        self.buffers.take()
+    }
+
+    /// Takes back a buffer.
+    pub(super) fn recycle(&mut self, buffer: Vec<u8>) {
+        self.buffers.give(buffer);
+    }
+
+    /// Gives a topic with waiting items a turn.
+    pub(super) fn resume(&mut self, at: Handle) {
+        if let Some(entry) = self.topics.at_mut(at)
+            && !entry.ready
+            && entry.has_more()
+        {
+            entry.ready = true;
+            self.ready.push_back(at);
+        }
+    }
 }
+
+/// The maximum number of unknown topics of other spaces. It limits memory, because any sender in
+/// the group can invent topics.
+pub(super) const MAX_STRAYS: usize = 16_384;

@@ -165,7 +165,7 @@ impl Router {
             .filter(|(_, entry)| entry.said.is_some());
         let topics = calls
             .map(|(topic, _)| *topic)
-            .chain(said.map(|(topic, _)| *topic));
+            .chain(said.map(|(topic, _)| topic));
         let topics: Vec<TopicId> = topics.collect();
         for topic in topics {
             self.withdraw(topic, now);

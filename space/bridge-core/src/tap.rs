@@ -5,12 +5,11 @@ use std::net::SocketAddr;
 
 use mappings::TopicId;
 
-use super::{Router, Values};
 use crate::counters::{Cause, Reason};
 
 /// The tapped topics and the events that were not taken yet.
 #[derive(Debug, Default)]
-pub(super) struct Tap {
+pub(crate) struct Tap {
     topics: Vec<TopicId>,
     events: VecDeque<Tapped>,
     /// The number of events for which there was no room.
@@ -68,57 +67,49 @@ pub enum Crossing {
     },
 }
 
-impl Router {
+impl Tap {
     /// Sets the tapped topics. Without topics, nothing is recorded.
-    pub fn tap(&mut self, topics: &[TopicId]) {
-        if topics.is_empty() {
-            self.values.tap = None;
+    pub(crate) fn set(&mut self, topics: &[TopicId]) {
+        if self.topics == topics {
             return;
         }
-        let tap = self.values.tap.get_or_insert_default();
-        if tap.topics != topics {
-            tap.topics = topics.to_vec();
-            tap.events.retain(|event| topics.contains(&event.topic));
+        self.topics = topics.to_vec();
+        self.events.retain(|event| topics.contains(&event.topic));
+        if topics.is_empty() {
+            *self = Self::default();
         }
     }
 
     /// Returns whether topics are tapped.
-    #[must_use]
-    pub const fn is_tapped(&self) -> bool {
-        self.values.tap.is_some()
+    pub(crate) const fn is_on(&self) -> bool {
+        !self.topics.is_empty()
     }
 
-    /// Takes the oldest event of the tapped topics.
-    pub fn next_tapped(&mut self) -> Option<Tapped> {
-        self.values.tap.as_mut()?.events.pop_front()
+    /// Returns whether the topic is tapped.
+    pub(crate) fn taps(&self, topic: TopicId) -> bool {
+        self.topics.contains(&topic)
+    }
+
+    /// Takes the oldest event.
+    pub(crate) fn next(&mut self) -> Option<Tapped> {
+        self.events.pop_front()
     }
 
     /// Takes the number of events for which there was no room.
-    pub fn take_lost_taps(&mut self) -> u64 {
-        let tap = self.values.tap.as_mut();
-        tap.map_or(0, |tap| std::mem::take(&mut tap.lost))
+    pub(crate) const fn take_lost(&mut self) -> u64 {
+        std::mem::replace(&mut self.lost, 0)
     }
-}
 
-impl Values {
     /// Records an event of a topic, if the topic is tapped.
-    pub(super) fn note(&mut self, topic: TopicId, crossing: impl FnOnce() -> Crossing) {
-        let Some(tap) = &mut self.tap else {
-            return;
-        };
-        if !tap.topics.contains(&topic) {
-            return;
+    #[inline]
+    pub(crate) fn note(&mut self, topic: TopicId, crossing: impl FnOnce() -> Crossing) {
+        if self.is_on() && self.taps(topic) {
+            self.push(topic, crossing());
         }
-        if tap.events.len() >= MOST_EVENTS {
-            tap.events.pop_front();
-            tap.lost += 1;
-        }
-        let crossing = crossing();
-        tap.events.push_back(Tapped { topic, crossing });
     }
 
     /// Records the drop of samples, if the topic is tapped.
-    pub(super) fn note_drop(
+    pub(crate) fn note_drop(
         &mut self,
         (topic, from): (TopicId, Option<SocketAddr>),
         Cause { reason, case }: Cause,
@@ -133,10 +124,12 @@ impl Values {
         });
     }
 
-    /// Returns whether the topic is tapped.
-    pub(super) fn taps(&self, topic: TopicId) -> bool {
-        let tap = self.tap.as_ref();
-        tap.is_some_and(|tap| tap.topics.contains(&topic))
+    fn push(&mut self, topic: TopicId, crossing: Crossing) {
+        if self.events.len() >= MOST_EVENTS {
+            self.events.pop_front();
+            self.lost += 1;
+        }
+        self.events.push_back(Tapped { topic, crossing });
     }
 }
 

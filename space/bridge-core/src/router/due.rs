@@ -1,0 +1,212 @@
+//! Repetitions, keep-alives, silences, and the timers of topics.
+
+use std::cmp::Reverse;
+use std::time::{Duration, Instant};
+
+use mappings::TopicId;
+
+use super::about::About;
+use super::values::Values;
+use crate::counters::Reason;
+use crate::loss::Reaction;
+use crate::network::keep_alive;
+use crate::output::{Delivery, GOOD, Kept, Output};
+use crate::settings::{Local, Now};
+use crate::topic::{Item, Role};
+use crate::topics::Handle;
+use crate::writer::{Idle, Message};
+
+impl Values {
+    /// Repeats a value, sends a keep-alive, or detects the silence of a topic.
+    pub(super) fn handle_due(&mut self, at: Handle, now: Now) {
+        self.expire_held(at.topic(), now);
+        let (key_frames, keep_alives, silence) = self.periods();
+        let muted = self.is_muted();
+        let Some(entry) = self.topics.at_mut(at) else {
+            return;
+        };
+        match &mut entry.role {
+            Role::Theirs(reader) => {
+                if reader.fell_silent(now.monotonic, silence) {
+                    if self.settings.local != Local::Fields {
+                        reader.withdraw();
+                    }
+                    self.tell_silence(at);
+                    self.forget_base(at);
+                    self.lose(at, now);
+                } else if (entry.loss.as_ref().and_then(|loss| loss.due()))
+                    .is_some_and(|at| at <= now.monotonic)
+                {
+                    self.lose(at, now);
+                }
+            }
+            Role::Ours(writer) => {
+                if let Some(held) = entry
+                    .gate
+                    .as_mut()
+                    .and_then(|gate| gate.release(now.monotonic))
+                {
+                    self.let_go(at, Some(held), now);
+                    return;
+                }
+                if writer.look_again(now.monotonic) && !entry.ready {
+                    entry.ready = true;
+                    self.ready.push_back(at);
+                }
+                let Some((due, idle)) = writer.due(key_frames, keep_alives) else {
+                    return;
+                };
+                if due > now.monotonic {
+                    return;
+                }
+                match idle {
+                    Idle::Repeat => writer.begin_round(now.monotonic),
+                    Idle::KeepAlive => {
+                        writer.spoke(now.monotonic);
+                        let expected = writer.expected_sequence();
+                        // Waiting items contain more information than a keep-alive.
+                        let buffer = self.buffers.take();
+                        if !muted
+                            && !entry.has_more()
+                            && let Some(datagram) =
+                                keep_alive(buffer, at.topic(), expected, now.utc)
+                        {
+                            entry.counters.keep_alives += 1;
+                            let item = Item::Message(Message::Datagram(datagram));
+                            let bytes = item.bytes();
+                            // The queue is empty, so nothing is dropped.
+                            drop(entry.queue.push(item, bytes));
+                        }
+                    }
+                }
+                if !entry.ready && entry.has_more() {
+                    entry.ready = true;
+                    self.ready.push_back(at);
+                }
+            }
+        }
+    }
+
+    /// Delivers the reaction to the loss of a commander from the mapping, if a value was delivered
+    /// after the last reaction.
+    pub(super) fn lose(&mut self, at: Handle, now: Now) {
+        let loss = self.topics.at_mut(at).and_then(|of| of.loss.as_mut());
+        let Some(reaction) = loss.and_then(|loss| loss.take()) else {
+            return;
+        };
+        let (of, stop) = match reaction {
+            Reaction::Publish(stop) => (at.topic(), Some(stop)),
+            Reaction::Call(by) => {
+                let trigger = self.topics.get(&by).and_then(|of| of.trigger.as_deref());
+                (by, trigger.cloned())
+            }
+        };
+        let muted = self.is_muted_locally();
+        if !muted {
+            self.tell(Output::CommanderLost { topic: at.topic() });
+        }
+        let mut payload = self.buffer();
+        let written = match stop {
+            Some(stop) => stop.write(now.utc, &mut payload),
+            None => Err(format!("the service of {by} is not known here", by = of)),
+        };
+        if let Err(detail) = written {
+            self.recycle(payload);
+            self.count(
+                About::topic(at.topic()),
+                (Reason::NotPublished, "on_loss"),
+                1,
+                || format!("`on_loss`: {detail}"),
+            );
+            return;
+        }
+        let delivery = Delivery {
+            topic: of,
+            payload,
+            source: Some(now.utc),
+            status: GOOD,
+            arrived: now.utc,
+            instance: None,
+            kept: Kept::Alone,
+            lasting: false,
+        };
+        if muted {
+            self.mute_loss(delivery, now);
+        } else {
+            self.push_to(of, Item::Delivery(delivery));
+        }
+    }
+
+    /// Adds the topic to the timer list with its next due time.
+    pub(super) fn schedule(&mut self, at: Handle) {
+        let (key_frames, keep_alives, silence) = self.periods();
+        let Some(entry) = self.topics.at_mut(at) else {
+            return;
+        };
+        let due = match &entry.role {
+            Role::Ours(writer) => {
+                let held = entry.gate.as_ref().and_then(|gate| gate.due());
+                let idle = writer.due(key_frames, keep_alives).map(|(at, _)| at);
+                let announce = entry.announce_at;
+                let again = writer.again_at();
+                let due = held.into_iter().chain(idle).chain(announce);
+                due.chain(again).min()
+            }
+            Role::Theirs(reader) => {
+                let hold = entry.loss.as_ref().and_then(|loss| loss.due());
+                let held = reader.held.as_ref().and_then(|held| held.expires());
+                let due = reader.due(silence).into_iter().chain(hold);
+                due.chain(held).min()
+            }
+        };
+        // An earlier entry stays: it finds nothing due and schedules the topic again. This avoids a
+        // new entry for each sample.
+        if let Some(due) = due
+            && entry.timer.is_none_or(|planned| due < planned)
+        {
+            entry.timer = Some(due);
+            self.timers.push(Reverse((due, at)));
+        }
+    }
+
+    /// Schedules a topic by its name.
+    pub(super) fn schedule_topic(&mut self, topic: TopicId) {
+        if let Some(at) = self.topics.find(topic) {
+            self.schedule(at);
+        }
+    }
+
+    /// Returns the next topic that is due.
+    pub(super) fn next_due(&mut self, now: Now) -> Option<Handle> {
+        while let Some(Reverse((due, at))) = self.timers.peek().copied() {
+            if due > now.monotonic {
+                return None;
+            }
+            self.timers.pop();
+            if let Some(entry) = self.topics.at_mut(at)
+                // Otherwise a later entry has replaced this entry.
+                && entry.timer == Some(due)
+            {
+                entry.timer = None;
+                return Some(at);
+            }
+        }
+        None
+    }
+
+    /// Returns the time at which the next topic is due.
+    pub(super) fn due(&self) -> Option<Instant> {
+        self.timers.peek().map(|Reverse((due, _))| *due)
+    }
+
+    /// Returns the periods of key frames and keep-alives, and the time after which a topic is
+    /// silent.
+    pub(super) fn periods(&self) -> (Duration, Duration, Duration) {
+        let pubsub = self.mapping.pubsub();
+        (
+            pubsub.key_frame_period,
+            pubsub.keep_alive_period,
+            pubsub.receive_timeout,
+        )
+    }
+}
