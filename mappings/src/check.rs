@@ -146,9 +146,9 @@ impl Checked {
                 found.severity = Severity::Warning;
                 let whom: Vec<String> = found.needed_by.iter().map(ToString::to_string).collect();
                 let whom = match whom.as_slice() {
-                    [one] => format!("only the program that serves space {one} is stopped by it"),
+                    [one] => format!("this stops only the program that serves space {one}"),
                     all => format!(
-                        "only a program that serves the spaces {} is stopped by it",
+                        "this stops only programs that serve the spaces {}",
                         all.join(" and ")
                     ),
                 };
@@ -268,7 +268,7 @@ fn type_paths(
         .filter(|(path, place)| {
             if path.is_empty() {
                 findings
-                    .error(Code::WrongValue, *place, "an empty path")
+                    .error(Code::WrongValue, *place, "the path is empty")
                     .help("`.` is the folder of the mapping");
             }
             !path.is_empty()
@@ -288,7 +288,7 @@ fn note_faults(faults: Vec<PathFault>, places: &[Place], findings: &mut Findings
                 .help("a folder with ROS packages in it, or a file as my_msgs/msg/Name.msg, relative to the mapping"),
             PathFaultKind::File(why) => findings
                 .warning(Code::DefinitionFile, *place, why)
-                .help("the file counts as not there; all others count"),
+                .help("this file is ignored; all other files are read"),
         };
     }
 }

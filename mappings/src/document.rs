@@ -1225,7 +1225,7 @@ impl Read for Queue {
                 let size = reader.field::<u16>(size);
                 match size.as_ref().map(|at| (at.value, at.place)) {
                     Some((Some(0), place)) => {
-                        let message = "a queue of no places holds nothing";
+                        let message = "a queue of size 0 cannot hold a value";
                         reader
                             .findings
                             .error(Code::WrongValue, place, message)
@@ -1237,7 +1237,7 @@ impl Read for Queue {
                         reader.findings.error(
                             Code::MissingKey,
                             node.place,
-                            "`drop_oldest` has no number",
+                            "`drop_oldest` needs a number",
                         );
                         None
                     }
@@ -1292,7 +1292,8 @@ pub(crate) fn read(root: &Node<'_>, reader: &mut Reader<'_>) -> Option<(Document
         if root.place.file == 0 {
             let message = "the document is empty: it declares no spaces, values or calls";
             let note = reader.findings.error(Code::MissingKey, root.place, message);
-            note.help("`ua-space init` writes a mapping of what is there; programs that need no mapping are started without one");
+            note.help("make a mapping of the running cell with `ua-space init`; start programs that need no \
+                       mapping without a file");
         }
         return Some((Document::default(), root.place));
     }

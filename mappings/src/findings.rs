@@ -195,7 +195,10 @@ impl Findings {
             } else {
                 Severity::Warning
             };
-            let (label, help) = (None, Some("mend the first ones and check again".to_owned()));
+            let (label, help) = (
+                None,
+                Some("correct the first findings and check again".to_owned()),
+            );
             all.push(Diagnostic {
                 code: Code::TooLarge,
                 severity,

@@ -97,7 +97,7 @@ impl<'a> Loader<'a> {
         {
             if value.as_ref().is_some_and(|named| named.contains("://")) {
                 let note = self.findings.warning(Code::TypePath, *place, URL);
-                note.help("a folder with ROS packages in it, or a file, relative to the mapping; a URL brings no types");
+                note.help("give a folder with ROS packages, or a file, relative to the mapping; URLs are not supported");
                 *value = None;
             }
             // An empty text stays empty, so that a finding reports it.
@@ -131,7 +131,7 @@ impl<'a> Loader<'a> {
             if value.as_ref().is_some_and(|named| named.contains("://")) {
                 let note = self.findings.error(Code::NodeSet, *place, URL);
                 note.help(
-                    "files are read from the disk: write a path, from the folder of this file",
+                    "give a path relative to the folder of this file; only local files are read",
                 );
                 *value = None;
             }
@@ -154,16 +154,16 @@ impl<'a> Loader<'a> {
         };
         let readers = self.around.readers(path);
         let note = self.findings.warning(Code::Secret, *place, message);
-        let apart = "write it as ${NAME}, which the environment of the program gives";
+        let apart = "write ${NAME}, and set this environment variable for the program";
         let Some(readers) = readers else {
             note.help(apart);
             return;
         };
         let (who, mode) = match readers {
             Readers::Group => ("the group of the file", "g-r"),
-            Readers::Everybody => ("everybody on this host", "go-r"),
+            Readers::Everybody => ("every user of this host", "go-r"),
         };
-        let help = format!("{apart}, or keep the file to its owner: chmod {mode} {path}");
+        let help = format!("{apart}, or restrict the file to its owner: chmod {mode} {path}");
         note.label(format!("{who} can read it")).help(help);
     }
 
@@ -177,14 +177,14 @@ impl<'a> Loader<'a> {
     fn include(&mut self, named: &str, place: Place) {
         if named.contains("://") {
             let note = self.findings.error(Code::Include, place, URL);
-            note.help("files are read from the disk: write a path, from the folder of this file");
+            note.help("give a path relative to the folder of this file; only local files are read");
             self.partial = true;
             return;
         }
         let from = self.open.last().cloned().unwrap_or_default();
         let (folder, last) = named.rsplit_once('/').unwrap_or(("", named));
         if folder.contains('*') {
-            let message = format!("`*` stands in the folder of `{named}`");
+            let message = format!("the folder of `{named}` contains `*`");
             let note = self.findings.error(Code::Include, place, message);
             note.help("only the last part of a path has wildcards, as in robots/*.yaml");
             return;
@@ -201,14 +201,14 @@ impl<'a> Loader<'a> {
         let names = match self.around.list(&within) {
             Ok(names) => names,
             Err(why) => {
-                let message = format!("`{named}` names no files: {why}");
+                let message = format!("cannot list the files of `{named}`: {why}");
                 self.findings.error(Code::Include, place, message);
                 return;
             }
         };
         let mut names: Vec<String> = names.into_iter().filter(is_wanted).collect();
         if names.is_empty() {
-            let message = format!("no file is named as `{named}` says");
+            let message = format!("no file matches `{named}`");
             self.findings.warning(Code::Include, place, message);
         }
         names.sort();
@@ -238,7 +238,7 @@ impl<'a> Loader<'a> {
         }
         if self.open.len() > MAX_NESTED || self.read.len() > MAX_FILES {
             let message = format!(
-                "`{path}` is one file too many: includes nest {MAX_NESTED} deep at most and lead to {MAX_FILES} files"
+                "`{path}` exceeds the limit of includes: at most {MAX_NESTED} levels and {MAX_FILES} files"
             );
             self.findings.error(Code::IncludeTwice, place, message);
             return;
@@ -248,7 +248,7 @@ impl<'a> Loader<'a> {
             Err(why) => {
                 let message = format!("`{path}` cannot be read: {why}");
                 let note = self.findings.error(Code::Include, place, message);
-                note.help("the path is taken from the folder of the file it stands in");
+                note.help("the path is relative to the folder of the file that contains it");
                 self.partial = true;
                 return;
             }
@@ -349,12 +349,12 @@ fn once<T>(key: &str, whole: &mut Field<T>, part: Field<T>, findings: &mut Findi
             let message = format!("the key `{key}` is repeated");
             let note = findings.error(Code::DuplicateKey, part.place, message);
             note.label(format!("first at {line}"))
-                .help("all files together are one document, which has it once");
+                .help("all included files are one document, in which the key occurs once");
         }
     }
 }
 
 /// Message without the URL, which may contain a password.
-const URL: &str = "a URL stands where a path of a file is wanted";
+const URL: &str = "expected the path of a file, found a URL";
 const MAX_NESTED: usize = 8;
 const MAX_FILES: usize = 256;

@@ -53,16 +53,16 @@ pub struct PatternFault {
 #[non_exhaustive]
 pub enum PatternReason {
     /// The text with the captures in it is not a node id.
-    #[error("`{0}` is no node id")]
+    #[error("`{0}` is not a node id")]
     Node(String),
     /// The identifier or alias with the captures in it is not a number from 1 to 65535.
-    #[error("`{0}` is no number from 1 to 65535")]
+    #[error("`{0}` is not a number from 1 to 65535")]
     Number(String),
     /// The name is empty or longer than 512 characters.
     #[error("its name would not have 1 to 512 characters")]
     Name,
     /// A variable or call of the mapping has the same topic of the space or the same node.
-    #[error("`{0}` is `{1}` of the mapping already")]
+    #[error("`{0}` is already `{1}` of the mapping")]
     Taken(TopicId, String),
 }
 
@@ -166,7 +166,7 @@ impl Glob {
         }
         let strange = |c: char| !c.is_ascii_alphanumeric() && !"/_*".contains(c);
         if text.contains(strange) {
-            return Err("only letters, digits, underscores, slashes and `*` stand in it");
+            return Err("use only letters, digits, underscores, slashes and `*`");
         }
         let mut before = Vec::new();
         let mut after: Option<Vec<Vec<String>>> = None;

@@ -172,8 +172,8 @@ impl<'f> Reader<'f> {
             let note = self.findings.error(Code::UnknownKey, place, message);
             let near = nearest(key, keys);
             note.help_with(|| match near {
-                Some(near) => format!("did you mean `{near}`? Known here are {}", list(&keys)),
-                None => format!("known here are {}", list(&keys)),
+                Some(near) => format!("did you mean `{near}`? The keys here are {}", list(&keys)),
+                None => format!("the keys here are {}", list(&keys)),
             });
             misspelt.extend(near.map(|near| (near, &**value)));
         }
@@ -239,7 +239,7 @@ impl Read for f64 {
             .ok()
             .filter(|_| text.contains(|c: char| c.is_ascii_digit()) && !is_octal(text));
         if number.is_none() {
-            let message = format!("expected a number as 0.001, found `{}`", short(text));
+            let message = format!("expected a number such as 0.001, found `{}`", short(text));
             let note = reader.findings.error(Code::WrongValue, node.place, message);
             help_octal(note, text);
         }
@@ -285,7 +285,7 @@ pub(crate) fn help_octal(note: Note<'_>, text: &str) {
         let plain = text.trim_start_matches('0');
         let plain = if plain.is_empty() { "0" } else { plain };
         note.help(format!(
-            "zeros in front make a number octal in YAML 1.1; write `{}`",
+            "leading zeros make a number octal in YAML 1.1: write `{}`",
             short(plain)
         ));
     }

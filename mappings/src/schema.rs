@@ -15,7 +15,7 @@ pub fn schema() -> String {
     Variables { words }.transform(&mut schema);
     if let Some(Value::Object(defs)) = schema.get_mut("$defs") {
         let variable = json_schema!({
-            "description": "An environment variable stands here, as ${CELL_TTL} or ${CELL_TTL:-1}.",
+            "description": "An environment variable, such as ${CELL_TTL} or ${CELL_TTL:-1}.",
             "type": "string",
             "pattern": VARIABLE
         });

@@ -67,7 +67,7 @@ pub(crate) struct Alone;
 
 impl Surroundings for Alone {
     fn read(&self, _: &str) -> Result<String, String> {
-        Err("only this text is read here".to_owned())
+        Err("only this text is available".to_owned())
     }
 
     fn list(&self, _: &str) -> Result<Vec<String>, String> {

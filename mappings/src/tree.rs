@@ -152,11 +152,11 @@ fn read<'t>(
         let (event, marks) = event.map_err(|error| syntax(text, &error))?;
         if let Some(tag) = event.tag() {
             let place = place(text, marks.tag_span().unwrap_or(marks));
-            let message = format!("the tag `{}` is not read here", tag.original());
+            let message = format!("the tag `{}` is not supported", tag.original());
             return Err(fault(
                 place,
                 message,
-                Some("leave the tag out; the key says what its value is"),
+                Some("remove the tag; the key determines the type of its value"),
             ));
         }
         let place = Place {
@@ -211,7 +211,7 @@ impl<'t> Builder<'_, 't> {
             Event::DocumentStart(..) => {
                 self.documents += 1;
                 if self.documents > 1 {
-                    let help = Some("one file is one document: remove the `---`");
+                    let help = Some("a file contains one document: remove the `---`");
                     return Err(fault(
                         place,
                         "a second document begins here".to_owned(),
@@ -271,14 +271,14 @@ impl<'t> Builder<'_, 't> {
                 Err(fault(
                     place,
                     message,
-                    Some("a text that begins with * stands in quotes: \"*\""),
+                    Some("put a text that begins with * into quotes: \"*\""),
                 ))
             }
             Event::StreamStart | Event::StreamEnd | Event::DocumentEnd | Event::Anchor(..) => {
                 Ok(())
             }
             // The enumeration is open: a node of an unknown kind would be missing from the tree.
-            other => Err(fault(place, format!("{other:?} is not read here"), None)),
+            other => Err(fault(place, format!("{other:?} is not supported"), None)),
         }
     }
 
@@ -314,8 +314,8 @@ impl<'t> Builder<'_, 't> {
             self.faults.push(Fault {
                 code: Code::EnvironmentVariable,
                 place,
-                message: "an environment variable stands in a key".to_owned(),
-                help: Some("variables stand in values only; write the key out"),
+                message: "a key contains an environment variable".to_owned(),
+                help: Some("use environment variables in values only; write the key without one"),
             });
         }
         text
@@ -337,8 +337,8 @@ impl<'t> Builder<'_, 't> {
             self.faults.push(Fault {
                 code: Code::EnvironmentVariable,
                 place,
-                message: format!("`{text}` is no environment variable here, but the text itself"),
-                help: Some("a variable is written ${NAME}; the text itself stands in quotes"),
+                message: format!("`{text}` is read as a text here, not as an environment variable"),
+                help: Some("write a variable as ${NAME}; put the text itself into quotes"),
             });
         }
     }
@@ -527,8 +527,8 @@ fn syntax(text: &str, error: &ScanError) -> Fault {
         .iter()
         .any(|(number, line)| *number == place.line && line.contains("${"));
     let help = match is_variable {
-        true => "a text with ${NAME} stands in quotes between braces or brackets: \"${NAME}\"",
-        false => "nothing after this place has been checked",
+        true => "put a text with ${NAME} between braces or brackets into quotes: \"${NAME}\"",
+        false => "the document after this position was not checked",
     };
     fault(place, error.info(), Some(help))
 }

@@ -19,8 +19,8 @@ pub(crate) fn expand(text: &str, lookup: &dyn Fn(&str) -> Option<String>) -> Exp
         out.push_str(before);
         let Some((inside, behind)) = behind.split_once('}') else {
             return Err((
-                "`${` is not ended by `}`".to_owned(),
-                "write `$${` for the text `${` itself",
+                "`${` has no closing `}`".to_owned(),
+                "write `$${` for the text `${`",
             ));
         };
         let (name, default) = match inside.split_once(":-") {
@@ -28,7 +28,7 @@ pub(crate) fn expand(text: &str, lookup: &dyn Fn(&str) -> Option<String>) -> Exp
             None => (inside, None),
         };
         if !is_name(name) {
-            let message = format!("`${{{inside}}}` names no environment variable");
+            let message = format!("`${{{inside}}}` is not an environment variable");
             return Err((
                 message,
                 "a name has letters, digits and underscores: ${ROBOT_1}, ${ROBOT_1:-arm}",
@@ -44,15 +44,15 @@ pub(crate) fn expand(text: &str, lookup: &dyn Fn(&str) -> Option<String>) -> Exp
             (None, None) => {
                 return Err((
                     format!("the environment variable `{name}` is not set"),
-                    "set it where the program is started, or give it a default as ${NAME:-default}",
+                    "set it for the program, or give a default such as ${NAME:-default}",
                 ));
             }
         }
         rest = behind;
         if out.len() > MOST {
             return Err((
-                format!("it comes to more than {MOST} bytes"),
-                "a value of the mapping is a short text",
+                format!("its value is longer than {MOST} bytes"),
+                "use a short text",
             ));
         }
     }
@@ -106,10 +106,10 @@ mod tests {
     fn what_is_no_variable_is_named() {
         assert!(with("${NONE}").unwrap_err().contains("`NONE` is not set"));
         for (text, word) in [
-            ("${ROBOT", "not ended"),
+            ("${ROBOT", "has no closing"),
             ("${}", "`${}`"),
-            ("${1A}", "names no"),
-            ("${A B:-x}", "names no"),
+            ("${1A}", "is not an environment variable"),
+            ("${A B:-x}", "is not an environment variable"),
         ] {
             assert!(with(text).unwrap_err().contains(word), "{text}");
         }

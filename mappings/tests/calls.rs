@@ -143,8 +143,8 @@ fn what_a_goal_or_feedback_is_made_of_is_told_by_the_names_of_the_mapping() {
     for (maps, fault) in [
         (
             "feedback: {base_position: {field: current_pose}}",
-            "the goal of `nav2_msgs/NavigateToPose` cannot be made of that of `move_base_msgs/MoveBase`: \
-             `pose.header.stamp` (DateTime) is made of nothing",
+            "cannot make the goal of `nav2_msgs/NavigateToPose` from the goal of `move_base_msgs/MoveBase`: \
+             `pose.header.stamp` (DateTime) has no source",
         ),
         (
             "goal: {pose: {field: target_pose}, behaviour_tree: ''}, feedback: {base_position: {field: current_pose}}",
@@ -152,8 +152,8 @@ fn what_a_goal_or_feedback_is_made_of_is_told_by_the_names_of_the_mapping() {
         ),
         (
             "goal: {pose: {field: target_pose}, behavior_tree: ''}",
-            "the feedback of `move_base_msgs/MoveBase` cannot be made of that of `nav2_msgs/NavigateToPose`: \
-             `base_position.header.stamp` (DateTime) is made of nothing",
+            "cannot make the feedback of `move_base_msgs/MoveBase` from the feedback of `nav2_msgs/NavigateToPose`: \
+             `base_position.header.stamp` (DateTime) has no source",
         ),
     ] {
         assert_eq!(drive(maps), [(Code::CallMap, fault.to_owned())]);
@@ -204,7 +204,7 @@ fn a_constant_is_a_value_of_its_field_whoever_executes() {
     assert!(asked("true}").is_empty());
     assert_eq!(
         asked("on}"),
-        ["in the request of `std_srvs/SetBool`, `data` is Boolean, and its constant is none"]
+        ["in the request of `std_srvs/SetBool`, `data` is Boolean, but its constant is not"]
     );
     let fault = asked("true}, response: {success: maybe}");
     assert!(

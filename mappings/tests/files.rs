@@ -320,7 +320,7 @@ fn a_password_in_a_file_is_told_with_who_can_read_it_and_never_shown() {
         (
             None,
             "",
-            "write it as ${NAME}, which the environment of the program gives",
+            "write ${NAME}, and set this environment variable for the program",
         ),
         (
             Some(Readers::Group),
@@ -329,7 +329,7 @@ fn a_password_in_a_file_is_told_with_who_can_read_it_and_never_shown() {
         ),
         (
             Some(Readers::Everybody),
-            " everybody on this host can read it",
+            " every user of this host can read it",
             "chmod go-r plant/cameras.yaml",
         ),
     ] {
@@ -412,7 +412,8 @@ fn a_url_is_no_path_and_its_password_is_not_shown() {
             assert!(codes.any(|found| found == code), "{text}");
             let shown = checked.render(&text);
             assert!(
-                shown.contains("a URL stands where a path") && !shown.contains("sesame"),
+                shown.contains("expected the path of a file, found a URL")
+                    && !shown.contains("sesame"),
                 "{shown}"
             );
         }

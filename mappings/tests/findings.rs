@@ -78,7 +78,7 @@ impl NodeSets for Line {
                     "the NodeSet {} cannot be read: it is not there",
                     path.display()
                 ),
-                help: "the path is taken from the folder of the file it stands in".to_owned(),
+                help: "the path is relative to the folder of the file that contains it".to_owned(),
             })
             .collect()
     }

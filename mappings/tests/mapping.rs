@@ -509,10 +509,11 @@ fn topics_become_variables_by_the_first_pattern_about_them() {
     let told = |topic: &str| matching(topic).unwrap().unwrap_err().to_string();
     assert_eq!(
         told("/robotX/joint_states"),
-        "`/robotX/joint_states` matches the pattern `/robot*/joint_states`, but `ns=2;i=10X` is no node id"
+        "`/robotX/joint_states` matches the pattern `/robot*/joint_states`, but `ns=2;i=10X` is not a node id"
     );
     assert!(
-        told("/robot99999/joint_states").ends_with("`ns=2;i=1099999` is no number from 1 to 65535")
+        told("/robot99999/joint_states")
+            .ends_with("`ns=2;i=1099999` is not a number from 1 to 65535")
     );
 }
 
@@ -629,7 +630,7 @@ fn a_pattern_does_not_take_the_node_of_a_variable() {
     assert!(
         fault
             .to_string()
-            .ends_with("`ua_1_2_101` is `First` of the mapping already"),
+            .ends_with("`ua_1_2_101` is already `First` of the mapping"),
         "{fault}"
     );
     assert!(
@@ -796,8 +797,8 @@ fn a_binding_has_a_thousand_fields_at_most() {
             .collect::<Vec<_>>()
     };
     let told = |message: &str| vec![(Code::Fields, message.to_owned())];
-    assert_eq!(with(1001), told("`fields` names 1001 fields"));
-    assert_eq!(with(1000), told("`linear.x` is named twice"));
+    assert_eq!(with(1001), told("`fields` has 1001 fields"));
+    assert_eq!(with(1000), told("`linear.x` is listed twice"));
 }
 
 #[test]

@@ -48,7 +48,10 @@ fn a_type_that_only_another_host_needs_stops_only_its_program() {
         let warning = [(Code::UnknownMessageType, Severity::Warning)];
         assert_eq!(told(&part), warning);
         let help = part.findings[0].help.clone().unwrap();
-        assert!(help.contains("serves space 2 is stopped"), "{help}");
+        assert!(
+            help.contains("this stops only the program that serves space 2"),
+            "{help}"
+        );
         let mapping = part.mapping.unwrap();
         assert_eq!(mapping.bindings(space(1)).count(), 1);
     }

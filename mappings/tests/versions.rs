@@ -11,7 +11,7 @@ use messages::{Dialect, Registry, TypeName};
 const TOLD: [(&str, &str); 6] = [
     (
         "diagnostic_msgs/DiagnosticStatus",
-        "of other types: `level (SByte, Byte)`",
+        "with different types: `level (SByte, Byte)`",
     ),
     ("sensor_msgs/Range", "only in space 2: `variance`"),
     (
@@ -21,7 +21,7 @@ const TOLD: [(&str, &str); 6] = [
     ("std_msgs/Byte", ""),
     (
         "std_msgs/ByteMultiArray",
-        "of other types: `data (SByte[], ByteString)`",
+        "with different types: `data (SByte[], ByteString)`",
     ),
     (
         "visualization_msgs/Marker",

@@ -98,7 +98,7 @@ fn severity(said: &AlarmEntry, findings: &mut Findings) -> Option<u16> {
         return Some(*severity);
     }
     findings
-        .error(Code::Alarm, place, format!("{severity} is no severity"))
+        .error(Code::Alarm, place, format!("{severity} is not a severity"))
         .label("1 to 1000");
     None
 }
@@ -108,7 +108,7 @@ fn message(said: &AlarmEntry, findings: &mut Findings) -> Option<Option<String>>
         return said.message.is_none().then_some(None);
     };
     if text.trim().is_empty() || text.chars().count() > 1000 {
-        let message = "the message of an alarm is a text of up to 1000 characters";
+        let message = "the message of an alarm has 1 to 1000 characters";
         findings.error(Code::Alarm, place, message);
         return None;
     }
@@ -133,8 +133,8 @@ fn trigger(
     let count = given_ways.iter().filter(|given| **given).count();
     if count != 1 {
         let message = match count {
-            0 => "the alarm has nothing that triggers it",
-            _ => "the alarm has several things that trigger it",
+            0 => "the alarm has no trigger",
+            _ => "the alarm has several triggers",
         };
         findings
             .error(Code::Alarm, place, message)
@@ -148,7 +148,7 @@ fn trigger(
         ];
         for (key, place) in only_limits {
             if let Some(place) = place {
-                let message = format!("`{key}` goes with limits");
+                let message = format!("`{key}` requires limits");
                 findings.error(Code::Alarm, place, message);
                 return None;
             }
@@ -187,11 +187,11 @@ fn reports(
     if origin != SpaceId::UA || other.is_some() {
         let message = match other {
             Some(other) => format!("`reports` stands beside `{other}`"),
-            None => "the server makes values of origin 0 only".to_owned(),
+            None => "the server produces only values of origin 0".to_owned(),
         };
         findings
             .error(Code::Alarm, at.place, message)
-            .help("`reports: alarms` goes with `origin: 0`, without `from` and `alarm`");
+            .help("`reports: alarms` requires `origin: 0`, and excludes `from` and `alarm`");
         return None;
     }
     subject.is_diagnostics("reports", at.place, findings)
@@ -207,7 +207,7 @@ impl Subject<'_> {
             return Some(());
         }
         let message =
-            format!("`{key}` goes with the whole message of a diagnostic_msgs/DiagnosticArray");
+            format!("`{key}` requires the whole message of a diagnostic_msgs/DiagnosticArray");
         findings.error(Code::Alarm, place, message).help(
             "ros: {topic: /diagnostics, type: diagnostic_msgs/DiagnosticArray}, without `field` and `as`",
         );
@@ -224,10 +224,10 @@ fn levels(
     let is_number =
         matches!(subject.value_type, Some((builtin, false)) if messages::is_number(builtin));
     if !is_number {
-        let message = format!("limits go with a number, and this is {}", told(subject));
+        let message = format!("limits require a number, but this is {}", told(subject));
         findings
             .error(Code::Alarm, place, message)
-            .help("bind the one field it is of, or give the `type`");
+            .help("bind a single `field`, or give the `type`");
         return None;
     }
     let mut before: Option<f64> = None;
@@ -238,7 +238,7 @@ fn levels(
                 .error(
                     Code::Alarm,
                     at,
-                    format!("the limit {limit} is not above the one before it"),
+                    format!("the limit {limit} is not above the previous limit"),
                 )
                 .help("low_low < low < high < high_high");
             sound = false;
@@ -249,7 +249,7 @@ fn levels(
     if let Some((deadband, at)) = deadband
         && !(deadband.is_finite() && *deadband >= 0.0)
     {
-        let message = format!("the deadband {deadband} is no number from 0 on");
+        let message = format!("the deadband {deadband} is not a number from 0");
         findings.error(Code::Alarm, at, message);
         sound = false;
     }
@@ -308,10 +308,10 @@ fn value(
         Some(_) | None => None,
     };
     if found.is_none() {
-        let message = format!("`{}` is no value of {}", short(text), told(subject));
-        findings
-            .error(Code::Alarm, place, message)
-            .help("`normal` and `when` go with a Boolean, an integer or its `enum`, and a text");
+        let message = format!("`{}` is not a value of {}", short(text), told(subject));
+        findings.error(Code::Alarm, place, message).help(
+            "`normal` and `when` require a Boolean, an integer (or a text of its `enum`) or a text",
+        );
     }
     found
 }

@@ -119,7 +119,9 @@ impl<'c> Bindings<'c> {
                 let note = findings
                     .error(Code::BindingTwice, place, message)
                     .label(format!("first at {line}"));
-                note.help("one topic per space: a second one is a second variable");
+                note.help(
+                    "a variable has one topic per space: add a second variable for the other topic",
+                );
                 continue;
             }
             let site = Site {
@@ -182,7 +184,8 @@ impl<'c> Bindings<'c> {
         let Some(at) = &entry.space else {
             if subject.origin == Some(SpaceId::UA) {
                 let note = findings.error(Code::MissingKey, owner, "the binding has no `space`");
-                note.help("the value comes from the OPC UA side, which has no ROS topics: say whose topic it is");
+                note.help("the value comes from the OPC UA side, which has no ROS topics: give the `space` \
+                           of the topic");
                 return (None, owner);
             }
             return (subject.origin, owner);
@@ -196,7 +199,7 @@ impl<'c> Bindings<'c> {
                 at.place,
                 "space 0 is the OPC UA side and has no ROS topics",
             );
-            note.help("leave the binding out: the server shows every variable under its node");
+            note.help("remove the binding: the server shows every variable under its node");
             return (None, at.place);
         }
         (space, at.place)
@@ -261,10 +264,10 @@ impl<'c> Bindings<'c> {
             let text = at.value.as_ref()?;
             let name = text.parse().ok();
             if name.is_none() {
-                let message = format!("`{}` is no message type name", short(text));
+                let message = format!("`{}` is not a message type name", short(text));
                 findings
                     .error(Code::MessageTypeName, at.place, message)
-                    .help("package and name, as std_msgs/Bool");
+                    .help("give package and name, such as std_msgs/Bool");
             }
             return Some((name?, at.place));
         }
@@ -272,19 +275,19 @@ impl<'c> Bindings<'c> {
             if !site.subject.type_faulty {
                 let note =
                     findings.error(Code::MissingKey, site.place, "the binding has no `type`");
-                note.help("the ROS message type, as std_msgs/Bool; or give the variable a `type`");
+                note.help("give the ROS message type, such as std_msgs/Bool; or give the variable a `type`");
             }
             return None;
         };
         let name = Types::registry(dialect(site.space?)).standard_type(builtin, array);
         if name.is_none() {
             let message = format!(
-                "the binding has no `type`, and none of std_msgs holds {}",
+                "the binding has no `type`, and no type of std_msgs holds {}",
                 types::print((builtin, array))
             );
             findings
                 .error(Code::MissingKey, site.place, message)
-                .help("name the ROS message type, and the field if it has several");
+                .help("give the ROS message type, and the field if the type has several");
         }
         Some((name?, site.place))
     }
@@ -328,11 +331,12 @@ impl<'c> Bindings<'c> {
         let (note, why) = if read {
             let why = match dialect {
                 Dialect::Ros1 => {
-                    "the publisher's connection header brings it, and the field is checked then"
+                    "the connection header of the publisher contains the definition; the field is checked then"
                 }
                 Dialect::Ros2 => {
-                    "the publisher's node may tell it (ROS 2 Iron and later), and the field is checked then; a package \
-                     with its .msg file in `type_paths` or AMENT_PREFIX_PATH always does"
+                    "the node of the publisher may describe the type (ROS 2 Iron and later), and the field \
+                     is checked then; to be sure, add a package with its .msg file to `type_paths` or \
+                     AMENT_PREFIX_PATH"
                 }
             };
             (
@@ -342,10 +346,12 @@ impl<'c> Bindings<'c> {
         } else {
             let why = match dialect {
                 Dialect::Ros1 => {
-                    "what is written to ROS 1 must be known beforehand: name a folder with its .msg file in `type_paths`"
+                    "a type that is written to ROS 1 needs a definition: add a folder with its .msg file to \
+                     `type_paths`"
                 }
                 Dialect::Ros2 => {
-                    "what is written to ROS 2 must be known beforehand: name a folder with its .msg file in `type_paths`"
+                    "a type that is written to ROS 2 needs a definition: add a folder with its .msg file to \
+                     `type_paths`"
                 }
             };
             (
@@ -421,13 +427,15 @@ fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
         let note = findings
             .error(Code::ReadAndWritten, other.place, message)
             .label(label);
-        note.help("what is written there would come back as a value of its own: use two topics");
+        note.help(
+            "written values would be read again as values of the other variable: use two topics",
+        );
     } else if !other.reads {
         let message = format!("two variables are written to {topic}");
         let note = findings
             .error(Code::WrittenTwice, other.place, message)
             .label(label);
-        note.help("a topic shows one value: give each its own topic");
+        note.help("a topic can show one value: give each variable its own topic");
     } else if first.message_type != other.message_type {
         let (a, b) = (&first.message_type, &other.message_type);
         let message = format!("{topic} cannot be both {a} and {b}");
@@ -451,12 +459,13 @@ fn topic_name(
         && let Some(topic) = site.subject.topic
         && topic != other
     {
-        let message =
-            format!("`{text}` is the name of another value of the space; this one is `/{topic}`");
+        let message = format!(
+            "`{text}` is the name of another value of the space; the name of this value is `/{topic}`"
+        );
         findings
             .error(Code::SpaceName, place, message)
             .help(format!(
-                "write `/{topic}`, or a name that does not begin with ua_"
+                "use `/{topic}`, or a name that does not begin with ua_"
             ));
         return None;
     }
@@ -475,7 +484,7 @@ pub(super) fn ros_name(
             .error(
                 Code::RosTopic,
                 place,
-                format!("`{}` is no ROS {what} name", short(text)),
+                format!("`{}` is not a ROS {what} name", short(text)),
             )
             .label(fault);
         if let Some(mended) = mended(text, dialect) {
@@ -520,7 +529,7 @@ pub(super) fn compare(
             let message = format!("the variable is {told_type}, but bytes are a ByteString");
             findings
                 .error(Code::TypeDiffers, place, message)
-                .help("leave the variable's `type` out, or write `type: ByteString`");
+                .help("remove the `type` of the variable, or write `type: ByteString`");
         }
         [one] => {
             let found = types::print(types::value_type(one));
@@ -528,17 +537,17 @@ pub(super) fn compare(
                 "the variable is {told_type}, but `{}` of `{name}` is {found}",
                 one.path
             );
-            let help = format!("leave the variable's `type` out, or write `type: {found}`");
+            let help = format!("remove the `type` of the variable, or write `type: {found}`");
             findings.error(Code::TypeDiffers, place, message).help(help);
         }
         several => {
             let paths: Vec<&str> = several.iter().map(|leaf| leaf.path.as_str()).collect();
             let message = format!(
-                "the variable is one {told_type}, but `{name}` has {} fields",
+                "the variable is a single {told_type}, but `{name}` has {} fields",
                 several.len()
             );
             let help = format!(
-                "bind one `field` of {}, or leave the variable's `type` out",
+                "bind one `field` of {}, or remove the `type` of the variable",
                 told(&paths)
             );
             findings.error(Code::TypeDiffers, place, message).help(help);
@@ -569,12 +578,12 @@ fn differences(found: &[Found], findings: &mut Findings) {
         if differ_as_bytes(&first.binding, &other.binding) {
             let (a, b) = (&first.binding, &other.binding);
             let message = format!(
-                "the bytes of `{}` in space {} are no `{}` in space {}",
+                "the bytes of `{}` in space {} are not a `{}` in space {}",
                 a.message_type, a.space, b.message_type, b.space
             );
             let note = findings.error(Code::BindingsDiffer, other.place, message);
             note.label(format!("differs from {line}"))
-                .help("bytes cross as they are: only topics of one type and of one ROS can both have them");
+                .help("bytes are not converted: both topics must have the same type and the same ROS version");
         }
         if shape(fields) == shape(others) {
             versions((first, fields), (other, others), findings);
@@ -589,7 +598,7 @@ fn differences(found: &[Found], findings: &mut Findings) {
         let message = match (fields.as_slice(), others.as_slice()) {
             (a_fields, b_fields) if a_fields.len() == b_fields.len() && a_fields.len() > 1 => {
                 format!(
-                    "the fields of `{}` are not of the types of those of `{}`",
+                    "the fields of `{}` and `{}` have different types",
                     b.message_type, a.message_type
                 )
             }
@@ -627,14 +636,14 @@ fn versions(first: Side<'_>, other: Side<'_>, findings: &mut Findings) {
     };
     let (a, b) = (&first.0.binding, &other.0.binding);
     let message = format!(
-        "`{}` in space {} and `{}` in space {} have fields of other names in the same places",
+        "`{}` in space {} and `{}` in space {} have fields of different names at the same positions",
         a.message_type, a.space, b.message_type, b.space
     );
     findings
         .warning(Code::VersionsDiffer, other.0.place, message)
         .label(format!("differs from line {}", first.0.place.line))
         .help(format!(
-            "{sides}; they cross by their place: bind single fields where that is not meant"
+            "{sides}; fields are matched by position: bind single fields if this is not intended"
         ));
 }
 
@@ -660,7 +669,7 @@ fn sides((first, a): Side<'_>, (other, b): Side<'_>) -> Option<String> {
     });
     let typed: Vec<String> = typed.collect();
     let typed: Vec<&str> = typed.iter().map(String::as_str).collect();
-    let typed = (!typed.is_empty()).then(|| format!("of other types: {}", told(&typed)));
+    let typed = (!typed.is_empty()).then(|| format!("with different types: {}", told(&typed)));
     let parts = [only(first, a, b), only(other, b, a), typed];
     let parts: Vec<String> = parts.into_iter().flatten().collect();
     (!parts.is_empty()).then(|| parts.join("; "))

@@ -25,11 +25,11 @@ pub(super) fn check(entry: &PubSubEntry, findings: &mut Findings) -> Option<Box<
         return None;
     };
     let Some(address) = BrokerAddress::parse(text) else {
-        let message = format!("`{}` is no address of a broker", short(text));
+        let message = format!("`{}` is not an address of a broker", short(text));
         let mut note = findings.error(Code::Address, place, message);
         if has_user(text) {
-            note =
-                note.label("user name and password belong into a file: `mqtt: {credentials: ..}`");
+            note = note
+                .label("put the user name and the password into a file: `mqtt: {credentials: ..}`");
         }
         note.help(format!("for example {}", BrokerAddress::EXAMPLE));
         return None;
@@ -78,7 +78,7 @@ fn files(mqtt: &MqttEntry, broker: &mut Broker, findings: &mut Findings) {
                 None => (&mqtt.key, "certificate"),
             };
             if let Some(at) = at {
-                let message = format!("a client certificate needs `{missing}` too");
+                let message = format!("a client certificate also needs `{missing}`");
                 findings
                     .error(Code::MissingKey, at.place, message)
                     .help("certificate: client.pem, key: client.key");
@@ -90,11 +90,7 @@ fn files(mqtt: &MqttEntry, broker: &mut Broker, findings: &mut Findings) {
         return;
     }
     for at in [&mqtt.ca, &mqtt.certificate].into_iter().flatten() {
-        let note = findings.error(
-            Code::Address,
-            at.place,
-            "certificates are used with mqtts:// only",
-        );
+        let note = findings.error(Code::Address, at.place, "certificates require mqtts://");
         note.help(format!("address: mqtts://{}:8883", broker.address.host));
     }
     if let Some(at) = &mqtt.credentials
@@ -124,6 +120,6 @@ fn levels(field: &Field<String>, findings: &mut Findings) -> Option<String> {
     let message = format!("`{}` cannot be part of an MQTT topic", short(text));
     findings
         .error(Code::WrongValue, place, message)
-        .help("letters, digits and `/` between levels, as plant/cell-4");
+        .help("use letters, digits and `/` between levels, such as plant/cell-4");
     None
 }

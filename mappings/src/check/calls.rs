@@ -150,15 +150,15 @@ impl Checker<'_> {
         };
         let topics: Vec<TopicId> = kind.topics(topic).collect();
         if topics.len() < kind.parts().len() {
-            let message = format!("`{topic}` is an action, and there are not four numbers behind");
+            let message = format!("`{topic}` is an action, but fewer than four numbers follow it");
             findings
                 .error(Code::CallTopic, place, message)
-                .help("an action takes five numbers, so the first is at most 65531");
+                .help("an action takes five consecutive numbers: use 65531 or less");
             return None;
         }
         for (topic, part) in topics.into_iter().zip(kind.parts()) {
             let taken = match self.values.get(&topic) {
-                Some(name) => Some(format!("the variable `{}` has it", short(name))),
+                Some(name) => Some(format!("the variable `{}` uses it", short(name))),
                 None => self
                     .topics
                     .insert(topic, place)
@@ -170,9 +170,13 @@ impl Checker<'_> {
                 part => format!(", the {part} of the action,"),
             };
             findings
-                .error(Code::CallTopic, place, format!("`{topic}`{what} is taken"))
+                .error(
+                    Code::CallTopic,
+                    place,
+                    format!("`{topic}`{what} is already in use"),
+                )
                 .label(label)
-                .help("give one of them another node, or an `alias`");
+                .help("give one of the two another node, or an `alias`");
             return None;
         }
         self.free_node(node, place, findings).map(|()| topic)
@@ -189,15 +193,15 @@ impl Checker<'_> {
             self.nodes.get(node),
             self.call_nodes.insert(node.clone(), place),
         ) {
-            (Some(name), _) => format!("the variable `{}` has it", short(name)),
+            (Some(name), _) => format!("the variable `{}` uses it", short(name)),
             (None, Some(first)) => format!("first at {}", findings.line(first, place)),
             (None, None) => return Some(()),
         };
-        let message = format!("the node `{}` is taken", short(&node.to_string()));
+        let message = format!("the node `{}` is already in use", short(&node.to_string()));
         findings
             .error(Code::CallTopic, place, message)
             .label(label)
-            .help("give one of them another node");
+            .help("give one of the two another node");
         None
     }
 }
@@ -216,12 +220,12 @@ fn settle(
         && let Some(place) = executor.maps.place()
     {
         let message = format!(
-            "the {} that executes the call has its fields as they are",
+            "the {} that executes the call uses its own fields",
             executor.kind.word()
         );
         findings
             .error(Code::CallMap, place, message)
-            .help("write it beside those of other spaces, which ask for it");
+            .help("move this key to the bindings of other spaces, which request the call");
         return None;
     }
     let mut asked = Vec::new();

@@ -75,7 +75,7 @@ fn id(entry: &SpaceEntry, owner: Place, findings: &mut Findings) -> Option<(Spac
         let note = findings.error(
             Code::SpaceId,
             place,
-            format!("no ROS space can have the id {number}"),
+            format!("{number} cannot be the id of a ROS space"),
         );
         note.label(what)
             .help("1 is the ROS 1 space, 2 to 232 are ROS 2 spaces");
@@ -108,11 +108,11 @@ fn domain(
     };
     if !id.is_ros2() {
         let note = findings.error(Code::Domain, place, "ROS 1 has no DDS domain");
-        note.help("leave `domain` out; ROS_MASTER_URI says where the master is");
+        note.help("remove `domain`; ROS_MASTER_URI gives the address of the master");
         return (None, place);
     }
     if *domain > MAX_DOMAIN {
-        let message = format!("there is no DDS domain {domain}");
+        let message = format!("the DDS domain {domain} does not exist");
         findings
             .error(Code::Domain, place, message)
             .label(format!("0 to {MAX_DOMAIN}"));
@@ -145,23 +145,24 @@ pub(super) fn namespaces(
             continue;
         };
         if number == 0 {
-            let message = "namespace 0 is OPC UA's own and always there";
+            let message = "namespace 0 belongs to OPC UA and always exists";
             findings
                 .error(Code::Namespace, index.place, message)
                 .help("leave it out");
             continue;
         }
         if !is_uri(text) {
-            let message = format!("`{}` is no namespace URI", crate::read::short(text));
+            let message = format!("`{}` is not a namespace URI", crate::read::short(text));
             let mut note = findings.error(Code::Namespace, uri.place, message);
             if has_user(text) {
-                note = note.label("whoever connects can read it: it has no user name or password");
+                note =
+                    note.label("every client can read it: remove the user name and the password");
             }
-            note.help("for example urn:my-plant:line-1");
+            note.help("use a URI such as urn:my-plant:line-1");
         }
         if let Some((other, first)) = uris.insert(text, (number, index.place)) {
             let line = findings.line(first, uri.place);
-            let message = format!("namespaces {other} and {number} have one URI");
+            let message = format!("namespaces {other} and {number} have the same URI");
             findings
                 .error(Code::Namespace, uri.place, message)
                 .label(format!("first at {line}"));
@@ -174,7 +175,7 @@ pub(super) fn namespaces(
             findings
                 .error(Code::Namespace, index.place, message)
                 .label(format!("first at {line}"))
-                .help("each index once; 01 and 1 are one index");
+                .help("use each index once; 01 and 1 are the same index");
         }
     }
     declared

@@ -98,15 +98,15 @@ fn by_bridges(
             .error(
                 Code::Confirm,
                 place,
-                "`when` and `equals` stand without the variable that answers",
+                "`when` and `equals` require the variable that confirms",
             )
-            .help("add `by` with its node, as {by: ns=2;i=31}");
+            .help("add `by` with its node, such as {by: ns=2;i=31}");
         return None;
     }
     if written.destinations().next().is_none() {
         findings
-            .error(Code::Confirm, place, "the value goes to no other space")
-            .help("`confirm: bridge` goes with a topic or a service in another space than the `origin`");
+            .error(Code::Confirm, place, "the value is not sent to another space")
+            .help("`confirm: bridge` requires a topic or a service in a space other than the `origin`");
         return None;
     }
     if written.lasting == Lasting::State {
@@ -114,9 +114,9 @@ fn by_bridges(
             .error(
                 Code::Confirm,
                 place,
-                "the value is a state, which is repeated for as long as its producer lives",
+                "the value is a state, which is repeated while its producer runs",
             )
-            .help("leave `queue: keep_latest` out, so that it is an event");
+            .help("remove `queue: keep_latest`, so that it is an event");
         return None;
     }
     let Some(entry) = entry.filter(|entry| entry.within.is_some()) else {
@@ -131,7 +131,7 @@ fn by_bridges(
                 place,
                 "a value is sent again for a minute at most",
             )
-            .help("a command that comes later than that does harm");
+            .help("a command that arrives later can be dangerous");
         return None;
     }
     Some(within)
@@ -147,7 +147,7 @@ fn confirm(
     if !is_written(written) {
         findings
             .error(Code::Confirm, place, "no client writes this variable")
-            .help("`confirm` with `by` goes with `origin: 0`, and not with `from`");
+            .help("`confirm` with `by` requires `origin: 0`, and excludes `from`");
         return None;
     }
     let within = network::duration(&entry.within, findings);
@@ -156,15 +156,15 @@ fn confirm(
     }
     let (node, at) = required(&entry.by, "by", "`confirm`", place, findings)?;
     let Ok(node) = node.parse::<NodeIdText>() else {
-        let message = format!("`{}` is no node id", short(node));
+        let message = format!("`{}` is not a node id", short(node));
         findings.error(Code::NodeId, at, message);
         return None;
     };
     let Some(by) = by_node.get(&node) else {
         let message = format!("no variable has the node `{}`", short(&node.to_string()));
-        findings
-            .error(Code::Confirm, at, message)
-            .help("the node of the variable that the robot answers with, as ns=2;i=31");
+        findings.error(Code::Confirm, at, message).help(
+            "give the node of the variable with the response of the robot, such as ns=2;i=31",
+        );
         return None;
     };
     if is_written(by) {
@@ -172,9 +172,9 @@ fn confirm(
             .error(
                 Code::Confirm,
                 at,
-                "the answer is a variable that clients write, not one of the robot",
+                "the confirming variable is written by clients, not by the robot",
             )
-            .help("a variable of another space, or one that comes `from` a server");
+            .help("use a variable of another space, or a variable with `from`");
         return None;
     }
     let answer = answer(entry, (written, by), at, findings)?;
@@ -194,24 +194,20 @@ fn answer(
     if let Some((text, at)) = given(&entry.equals) {
         if entry.when.is_some() {
             findings
-                .error(
-                    Code::Confirm,
-                    at,
-                    "`when` and `equals` say both which answer counts",
-                )
-                .help("leave one of them out");
+                .error(Code::Confirm, at, "`when` and `equals` exclude each other")
+                .help("remove one of them");
             return None;
         }
         if !is_value(text, by.value_type) {
             let told = by.value_type.map(types::print);
             let message = format!(
-                "`{}` is no value of the answer, which is {}",
+                "`{}` is not a value of the confirming variable, which is {}",
                 short(text),
                 told.unwrap_or_else(|| "a message of several fields".to_owned())
             );
             findings
                 .error(Code::Confirm, at, message)
-                .help("one Boolean, number or text; bind the `field` that says it");
+                .help("it must be one Boolean, number or text; bind a single `field`");
             return None;
         }
         return Some(Answer::Equals(text.clone()));
@@ -224,9 +220,9 @@ fn answer(
                     .error(
                         Code::Confirm,
                         place,
-                        "the answer has another type than what is written, so it is never the same",
+                        "the confirming variable has another type than the written value, so they are never equal",
                     )
-                    .help("`equals: true`, or what else the robot answers; or `when: any`");
+                    .help("give the value that confirms, such as `equals: true`; or use `when: any`");
                 return None;
             }
             if by.publish.on_change {
@@ -234,9 +230,10 @@ fn answer(
                     .warning(
                         Code::Confirm,
                         place,
-                        "the answer is sent on change only: a value that is written twice is not confirmed the second time",
+                        "the confirming variable is sent only on change: the second write of the same value \
+                         is not confirmed",
                     )
-                    .help("leave `publish: on_change` and `deadband` of the answer out");
+                    .help("remove `publish: on_change` and `deadband` of the confirming variable");
             }
             Some(Answer::Same)
         }

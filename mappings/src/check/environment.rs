@@ -103,7 +103,7 @@ fn topic(
     let live = space.topics.get(name).filter(|topic| wanted(topic));
     let Some(live) = live else {
         let does = if read { "publishes" } else { "subscribes to" };
-        let message = format!("nobody {does} `{}` now", short(name));
+        let message = format!("no node {does} `{}` at the moment", short(name));
         let there = space.topics.iter().filter(|(_, topic)| wanted(topic));
         let near = nearest(name, there.map(|(name, _)| name.as_str()));
         let note = findings.warning(Code::TopicAway, place, message);
@@ -116,7 +116,7 @@ fn topic(
     let wanted = binding.message_type.as_str();
     if let Some(other) = live.types.iter().find(|one| one.as_str() != wanted) {
         let message = format!(
-            "`{}` is bound as {wanted}, and is {} now",
+            "`{}` is bound as {wanted}, but its current type is {}",
             short(name),
             short(other)
         );
@@ -128,9 +128,9 @@ fn topic(
 
 const fn absent_help(read: bool) -> &'static str {
     if read {
-        "is its node running, and in this graph?"
+        "check that its node runs, and in this graph"
     } else {
-        "what arrives for it is published all the same; is the node that takes it running?"
+        "the bridge publishes it anyway; check that the subscribing node runs"
     }
 }
 
@@ -165,7 +165,10 @@ fn service(
     let named = binding.and_then(|one| given(&one.call).or_else(|| given(&one.poll)));
     let place = named.map_or(place, |(_, place)| place);
     let Some(types) = services.get(service) else {
-        let message = format!("nobody offers the service `{}` now", short(service));
+        let message = format!(
+            "no node offers the service `{}` at the moment",
+            short(service)
+        );
         let note = findings.warning(Code::ServiceAway, place, message);
         if let Some(near) = nearest(service, services.keys().map(String::as_str)) {
             note.help(format!("did you mean `{}`?", short(near)));
@@ -175,7 +178,7 @@ fn service(
     let wanted = service_type.as_str();
     if let Some(other) = types.iter().find(|one| one.as_str() != wanted) {
         let message = format!(
-            "the service `{}` is called as {wanted}, and is {} now",
+            "the service `{}` is called as {wanted}, but its current type is {}",
             short(service),
             short(other)
         );
@@ -215,15 +218,18 @@ fn unmatched(
     if fits {
         return;
     }
-    let message = format!("no topic matches `{}` now", short(pattern.topics()));
+    let message = format!(
+        "no topic matches `{}` at the moment",
+        short(pattern.topics())
+    );
     let note = findings.warning(Code::PatternUnmatched, place, message);
     note.help(match other_types {
         Some((name, told)) => format!(
-            "`{}` would, but is a {}, which `type` does not take",
+            "`{}` matches the name, but its type {} differs from `type`",
             short(name),
             short(told)
         ),
-        None => "is a robot with such topics running? `*` stands within a part, `**` for parts"
+        None => "check that a robot with such topics runs; `*` matches within a part, `**` matches parts"
             .to_owned(),
     });
 }
@@ -245,10 +251,10 @@ fn namespace(index: u16, uri: &str, place: Place, server: &LiveServer, findings:
     let near = nearest(uri, server.namespaces.iter().map(String::as_str));
     note.help(match (found, near) {
         (Some(other), _) => {
-            format!("there the URI has index {other}: write ns={other} in the node ids, and here")
+            format!("the server has this URI at index {other}: write ns={other} in the node ids and here")
         }
         (None, Some(near)) => format!("did you mean `{}`?", short(near)),
-        (None, None) => "the server does not know the URI at all".to_owned(),
+        (None, None) => "the server does not have this URI".to_owned(),
     });
 }
 

@@ -35,10 +35,10 @@ pub(super) fn check(of: Option<&At<ServerEntry>>, findings: &mut Findings) -> Op
     };
     let (uris, first, most, networks) = (uris?, first?, most?, networks?);
     if first < 2 || first.checked_add(most - 1).is_none() {
-        let message = format!("{most} servers from namespace {first} on");
+        let message = format!("{most} servers from namespace {first}");
         findings
             .error(Code::Servers, owner, message)
-            .help("each has a namespace of its own, from `first` on, and these are 2 to 65535");
+            .help("each server takes a namespace from `first` on, within 2 to 65535");
         return None;
     }
     Some(FindSkills {
@@ -72,10 +72,10 @@ fn networks(entries: &[At<String>], place: Place, findings: &mut Findings) -> Op
                 .parse()
                 .is_ok_and(|prefix: u8| (16..=32).contains(&prefix))
         {
-            let message = format!("`{}` is no IPv4 network", short(text));
+            let message = format!("`{}` is not an IPv4 network", short(text));
             findings
                 .error(Code::Servers, entry.place, message)
-                .help("networks: [10.77.0.0/16], at most 65536 addresses each");
+                .help("for example networks: [10.77.0.0/16], at most 65536 addresses each");
             return None;
         }
         networks.push(text.clone());
@@ -106,12 +106,12 @@ fn application_uris(
         let is_pattern = begins.len() < text.len();
         if begins.contains('*') || !(is_pattern || is_uri(begins)) || begins.contains(' ') {
             let message = format!(
-                "`{}` is no ApplicationUri, and no beginning of one",
+                "`{}` is not an ApplicationUri or the beginning of one",
                 short(text)
             );
             findings
                 .error(Code::Servers, entry.place, message)
-                .help("urn:vendor:press, or urn:vendor:* for all that begin so");
+                .help("for example urn:vendor:press, or urn:vendor:* for all with this beginning");
             return None;
         }
         uris.push(text.clone());
@@ -137,7 +137,7 @@ pub(super) fn alone(
         let skills = server.skills?;
         Some((
             skills.namespace,
-            format!("is that of the skills of `{}`", short(&server.name)),
+            format!("belongs to the skills of `{}`", short(&server.name)),
         ))
     });
     let topics = variables
@@ -158,11 +158,11 @@ pub(super) fn alone(
     if let Some((namespace, what)) = other {
         let (first, last) = (namespaces.start(), namespaces.end());
         let message = format!(
-            "namespaces {first} to {last} are those of servers that are found, and {namespace} {what}"
+            "namespaces {first} to {last} are reserved for found servers, but {namespace} {what}"
         );
         findings
             .error(Code::Servers, place, message)
-            .help("let `first` begin where nothing else is, or let `most` be less");
+            .help("set `first` to a free range, or reduce `most`");
     }
 }
 

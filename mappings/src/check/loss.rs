@@ -55,7 +55,7 @@ fn loss(
         if let Some(hold) = &entry.hold {
             findings
                 .error(Code::OnLoss, hold.place, "`hold` stands without `on_loss`")
-                .help("say what is published when the time is over, as `on_loss: zero`");
+                .help("add the value that is published after this time, such as `on_loss: zero`");
         }
         return None;
     };
@@ -70,9 +70,9 @@ fn loss(
             .error(
                 Code::OnLoss,
                 at.place,
-                "the value is published to no ROS topic and calls no service",
+                "the value is not published to a ROS topic and does not call a service",
             )
-            .help("`on_loss` goes with a topic or a `call` in another space than the `origin`");
+            .help("`on_loss` requires a topic or a `call` in a space other than the `origin`");
         return None;
     }
     let action = match said {
@@ -107,10 +107,13 @@ fn stop_call(
     let found = node.parse::<NodeIdText>().ok();
     let found = found.and_then(|node| by_node.get(&node));
     if found.is_none() {
-        let message = format!("no variable with the node `{}` stops anything", short(node));
+        let message = format!(
+            "the node `{}` does not belong to a variable that can stop the robot",
+            short(node)
+        );
         findings
             .error(Code::OnLoss, at, message)
-            .help("a variable with a `call` that has no `field`, as {call: /stop, type: std_srvs/Trigger}");
+            .help("use a variable with a `call` without `field`, such as {call: /stop, type: std_srvs/Trigger}");
     }
     found.copied()
 }
@@ -127,9 +130,9 @@ fn fits(
             .error(
                 Code::OnLoss,
                 place,
-                "one value for a topic that is bound to several fields",
+                "a single value for a topic that is bound to several fields",
             )
-            .help("`zero`, or the fields of the message, as {linear.x: 0.1}");
+            .help("give `zero`, or fields of the message, such as {linear.x: 0.1}");
         return None;
     };
     if binding.selection == Selection::Bytes {
@@ -137,9 +140,9 @@ fn fits(
             .error(
                 Code::OnLoss,
                 place,
-                "the message crosses as bytes, of which no field is known",
+                "the message is transferred as bytes, so its fields are unknown",
             )
-            .help("leave `as: bytes` out");
+            .help("remove `as: bytes`");
         return None;
     }
     let dialect = dialect(binding.space);
@@ -161,10 +164,10 @@ fn fits_request(
             .error(
                 Code::OnLoss,
                 place,
-                "the request of the service has not one field that is the value",
+                "the request of the service does not have a single field for the value",
             )
             .help(
-                "fields of the request, as {data: false}, or {call: ns=2;i=48} for another service",
+                "give fields of the request, such as {data: false}, or {call: ns=2;i=48} for another service",
             );
         return None;
     };
@@ -242,18 +245,20 @@ fn warn(entry: &VariableEntry, variable: &Variable, findings: &mut Findings) {
     };
     if variable.lasting == Lasting::State {
         let place = entry.queue.as_ref().map_or(place, |at| at.place);
-        let message =
-            format!("`keep_latest` hands an old {message_type} to a subscriber that starts late");
+        let message = format!(
+            "`keep_latest` delivers an old {message_type} to a subscriber that starts late"
+        );
         findings
             .warning(Code::StoredMotion, place, message)
-            .help("leave `queue` out, so that only present subscribers get it");
+            .help("remove `queue`, so that only present subscribers receive it");
     }
     if motion == Motion::NotByZero && entry.on_loss.is_none() {
         let message = format!(
-            "nothing ends the movement of the last {message_type} when its commander is lost"
+            "the movement of the last {message_type} continues after its commander is lost"
         );
         findings
             .warning(Code::EndlessMotion, place, message)
-            .help("zero is a movement of this type: `on_loss` with the fields of a message that stops, or with a `call`");
+            .help("zero is a movement for this type: give `on_loss` the fields of a message that stops the \
+                   robot, or a `call`");
     }
 }

@@ -37,7 +37,7 @@ pub(super) fn check(
                         near.symbol, near.name, near.code
                     )
                 }
-                None => "a symbol as m/s, a UNECE code as MTS, or a name".to_owned(),
+                None => "use a symbol such as m/s, a UNECE code such as MTS, or a name".to_owned(),
             });
             sound = None;
         }
@@ -59,15 +59,15 @@ pub(super) fn check(
         });
         if value.1 || !whole {
             let told = told(value);
-            let message = format!("an `enum` goes with integers, and this is {told}");
+            let message = format!("an `enum` requires integers, but this is {told}");
             findings.error(Code::EnumTexts, place, message);
             sound = None;
         }
         if pairs.is_empty() || pairs.len() > MAX_TEXTS {
-            let message = format!("an `enum` of {} values", pairs.len());
+            let message = format!("the `enum` has {} values", pairs.len());
             findings
                 .error(Code::EnumTexts, place, message)
-                .help("1 to 1000, as {0: idle, 1: moving}");
+                .help("give 1 to 1000 values, such as {0: idle, 1: moving}");
             sound = None;
         }
         for (number, text) in pairs {
@@ -120,7 +120,7 @@ fn description(entry: &VariableEntry, findings: &mut Findings) -> Option<Option<
         return Some(None);
     };
     if text.trim().is_empty() || text.chars().count() > 1000 {
-        let message = "a description is a text of up to 1000 characters";
+        let message = "a description has 1 to 1000 characters";
         findings.error(Code::WrongValue, place, message);
         return None;
     }
@@ -139,10 +139,10 @@ fn numbers(
     if number && !value.1 {
         return Some(());
     }
-    let message = format!("a `{key}` goes with a number, and this is {}", told(value));
+    let message = format!("a `{key}` requires a number, but this is {}", told(value));
     findings
         .error(code, place, message)
-        .help("bind the one field it is of");
+        .help("bind a single `field`");
     None
 }
 
@@ -159,8 +159,8 @@ fn limits(bounds: &[At<f64>], place: Place, findings: &mut Findings) -> Option<(
         [low, high] if low.is_finite() && high.is_finite() && low < high => Some((low, high)),
         _ => {
             findings
-                .error(Code::ValueRange, place, "this is no range")
-                .help("the lowest and the highest value, as [0, 1.5]");
+                .error(Code::ValueRange, place, "this is not a range")
+                .help("give the lowest and the highest value, such as [0, 1.5]");
             None
         }
     }

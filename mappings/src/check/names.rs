@@ -12,7 +12,7 @@ pub(super) fn topic_fault(topic: &str, dialect: Dialect) -> Option<String> {
     };
     if topic.len() > MAX_TOPIC {
         return Some(format!(
-            "it has {} characters of at most {MAX_TOPIC}",
+            "it has {} characters, but at most {MAX_TOPIC} are allowed",
             topic.len()
         ));
     }
@@ -21,7 +21,7 @@ pub(super) fn topic_fault(topic: &str, dialect: Dialect) -> Option<String> {
         .find(|c| !c.is_ascii_alphanumeric() && !"/_".contains(*c))
     {
         return Some(format!(
-            "{strange:?} is neither letter, digit, underscore nor slash"
+            "{strange:?} is not a letter, digit, underscore or slash"
         ));
     }
     if parts.split('/').any(str::is_empty) {
@@ -29,7 +29,7 @@ pub(super) fn topic_fault(topic: &str, dialect: Dialect) -> Option<String> {
     }
     match dialect {
         Dialect::Ros1 if !parts.starts_with(|c: char| c.is_ascii_alphabetic()) => {
-            Some("in ROS 1 a letter comes first".to_owned())
+            Some("in ROS 1 a name begins with a letter".to_owned())
         }
         Dialect::Ros2 => {
             let digit = parts

@@ -33,7 +33,7 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
     let ttl = given(&entry.ttl).and_then(|(number, place)| {
         let ttl = u8::try_from(*number).ok();
         if ttl.is_none() {
-            let message = format!("a ttl of {number} does not fit into its one byte");
+            let message = format!("the ttl {number} exceeds 255");
             findings
                 .error(Code::WrongValue, place, message)
                 .label("0 to 255");
@@ -116,7 +116,7 @@ fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
     );
     let note = findings.error(Code::Timing, at.place, message);
     note.help(format!(
-        "three periods ride out two lost datagrams: receive_timeout: {:?}",
+        "three periods tolerate two lost datagrams: receive_timeout: {:?}",
         period.saturating_mul(3)
     ));
 }
@@ -124,31 +124,32 @@ fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
 /// Reads `opc.udp://host:port`; the default port is 4840 (OPC 10000-14, 7.3.2).
 fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAddr> {
     let Some(address) = PubSub::parse_address(text) else {
-        let message = format!("`{}` is no PubSub address", short(text));
+        let message = format!("`{}` is not a PubSub address", short(text));
         let mut note = findings.error(Code::Address, place, message);
         if has_user(text) {
-            note = note.label("it has no user name or password");
+            note = note.label("remove the user name and the password");
         }
         note.help(format!(
-            "a group or host by number, opc.udp://{}, or a broker, {}",
+            "give the IP address of a group or host, such as opc.udp://{}, or a broker, such as {}",
             PubSub::ADDRESS,
             BrokerAddress::EXAMPLE
         ));
         return None;
     };
     let unusable = if address.port() == 0 {
-        Some("port 0 cannot be sent to")
+        Some("port 0 is not a destination")
     } else if address.ip().is_unspecified() {
-        Some("the unspecified address cannot be sent to")
+        Some("the unspecified address is not a destination")
     } else if address.ip() == IpAddr::V4(Ipv4Addr::BROADCAST) {
-        Some("broadcasts are not sent")
+        Some("broadcasts are not supported")
     } else {
         None
     };
     if let Some(why) = unusable {
-        findings
-            .error(Code::Address, place, why)
-            .help(format!("for example opc.udp://{}", PubSub::ADDRESS));
+        findings.error(Code::Address, place, why).help(format!(
+            "use an address such as opc.udp://{}",
+            PubSub::ADDRESS
+        ));
         return None;
     }
     if address.ip() == IpAddr::V4(PubSub::DISCOVERY_GROUP) {
@@ -157,16 +158,21 @@ fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAd
             PubSub::DISCOVERY_GROUP
         );
         let note = findings.error(Code::DiscoveryGroup, place, message);
-        note.help(format!("for example opc.udp://{}", PubSub::ADDRESS));
+        note.help(format!(
+            "use an address such as opc.udp://{}",
+            PubSub::ADDRESS
+        ));
         return None;
     }
     if let IpAddr::V4(group) = address.ip()
         && group.is_multicast()
         && group.octets().first() != Some(&239)
     {
-        let message = format!("{group} is not one of the groups a site may use as it likes");
+        let message = format!("{group} is not a group for free use within a site");
         let note = findings.warning(Code::UnscopedGroup, place, message);
-        note.help("239.0.0.0 to 239.255.255.255 are; keep this one only if a publisher demands it");
+        note.help(
+            "use 239.0.0.0 to 239.255.255.255; keep this group only if a publisher requires it",
+        );
     }
     Some(address)
 }
@@ -180,12 +186,12 @@ fn interface(text: &str, place: Place, findings: &mut Findings) -> Option<String
         && !text.contains(|c: char| c.is_whitespace() || c.is_control() || c == '/');
     if !named && text.parse::<IpAddr>().is_err() {
         let message = format!(
-            "`{}` is neither the name nor the address of an interface",
+            "`{}` is not the name or the address of an interface",
             short(text)
         );
         findings
             .error(Code::Interface, place, message)
-            .help("`ip -brief address` lists them, as eth0 or 192.168.1.5");
+            .help("use a name or address of `ip -brief address`, such as eth0 or 192.168.1.5");
         return None;
     }
     Some(text.to_owned())
@@ -198,9 +204,9 @@ pub(super) fn duration(field: &Field<String>, findings: &mut Findings) -> Option
     let (text, place) = given(field)?;
     let duration = parse_duration(text);
     if duration.is_none() {
-        let message = format!("`{}` is no duration from 10ms to 1h", short(text));
+        let message = format!("`{}` is not a duration from 10ms to 1h", short(text));
         let note = findings.error(Code::Duration, place, message);
-        note.help("a number with its unit: 500ms, 1s, 2.5s, 1min");
+        note.help("give a number with its unit: 500ms, 1s, 2.5s, 1min");
     }
     duration
 }
@@ -239,10 +245,10 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
     let endpoint = given(&entry.endpoint).and_then(|(text, place)| {
         let endpoint = Endpoint::parse(text);
         if endpoint.is_none() {
-            let message = format!("`{}` is no endpoint", short(text));
+            let message = format!("`{}` is not an endpoint", short(text));
             let mut note = findings.error(Code::Endpoint, place, message);
             if has_user(text) {
-                note = note.label("it has no user name or password");
+                note = note.label("remove the user name and the password");
             }
             note.help(format!("for example {}", default.endpoint));
         }
@@ -252,10 +258,10 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         if is_uri(text) {
             return Some(text.clone());
         }
-        let message = format!("`{}` is no ApplicationUri", short(text));
+        let message = format!("`{}` is not an ApplicationUri", short(text));
         let mut note = findings.error(Code::ApplicationUri, place, message);
         if has_user(text) {
-            note = note.label("whoever connects can read it: it has no user name or password");
+            note = note.label("every client can read it: remove the user name and the password");
         }
         note.help(format!("for example {}", default.application_uri));
         None
@@ -324,12 +330,12 @@ pub(super) fn remote_endpoint(
 ) -> Option<Endpoint> {
     let endpoint = Endpoint::parse(text);
     if endpoint.is_none() {
-        let message = format!("`{}` is no endpoint", short(text));
+        let message = format!("`{}` is not an endpoint", short(text));
         let mut note = findings.error(Code::Endpoint, place, message);
         if has_user(text) {
-            note = note.label("it has no user name or password");
+            note = note.label("remove the user name and the password");
         }
-        note.help("for example opc.tcp://192.168.0.10:4840");
+        note.help("use an endpoint such as opc.tcp://192.168.0.10:4840");
     }
     endpoint
 }
@@ -360,7 +366,7 @@ fn security(
             let message = format!("the security policy {} is listed twice", policy.name());
             findings
                 .warning(Code::WrongValue, entry.place, message)
-                .help("leave it out here");
+                .help("remove it here");
         } else {
             policies.push(policy);
         }

@@ -31,7 +31,7 @@ pub(super) fn files(
     sound
         .filter(|(path, place)| {
             if path.is_empty() {
-                findings.error(Code::WrongValue, *place, "an empty path");
+                findings.error(Code::WrongValue, *place, "the path is empty");
             }
             !path.is_empty()
         })
@@ -122,7 +122,7 @@ fn nodes(document: &Document, mapping: &Mapping, sets: &dyn NodeSets, findings: 
             && node != NodeSetNode::Method
         {
             let message = format!(
-                "`{}` is no Method in its NodeSet",
+                "`{}` is not a Method in its NodeSet",
                 short(&call.node.to_string())
             );
             let place = given(&entry.node).map_or(at.place, |(_, place)| place);
@@ -139,7 +139,9 @@ fn created(node: &str, uri: &str, place: Place, findings: &mut Findings) {
         short(uri)
     );
     let note = findings.warning(Code::NodeSetNode, place, message);
-    note.help("a new one is made for the value: give it a namespace of its own, or mend its id");
+    note.help(
+        "the server adds a node for the value: correct the node id, or use another namespace",
+    );
 }
 
 fn variable(
@@ -150,9 +152,9 @@ fn variable(
 ) {
     let id = one.node.to_string();
     let NodeSetNode::Variable(..) = node else {
-        let message = format!("`{}` is no Variable in its NodeSet", short(&id));
+        let message = format!("`{}` is not a Variable in its NodeSet", short(&id));
         let note = findings.error(Code::NodeSetNode, place, message);
-        note.help("name a Variable; the objects and types around it are there by the NodeSet");
+        note.help("use a Variable; the NodeSet adds the objects and types around it");
         return;
     };
     let fields: Vec<_> = one.fields.iter().map(value_type).collect();
@@ -161,18 +163,18 @@ fn variable(
         (None, [only]) => *only,
         (None, [_, _, ..]) => {
             let message = format!(
-                "the value has {} fields, and the Variable `{}` of a NodeSet takes one value",
+                "the value has {} fields, but the Variable `{}` of a NodeSet takes one value",
                 fields.len(),
                 short(&id)
             );
             let note = findings.error(Code::NodeSetNode, place, message);
-            note.help("name one `field` of the message");
+            note.help("bind one `field` of the message");
             return;
         }
         (None, []) => {
             if let Some(wanted) = node.value_type() {
                 let message = format!(
-                    "nothing says of which type the value is; `{}` is {}",
+                    "the type of the value is not given; `{}` is {}",
                     short(&id),
                     print(wanted)
                 );
@@ -187,11 +189,11 @@ fn variable(
     }
     let wanted = node.value_type();
     let is = wanted.map_or_else(
-        || "takes no such value".to_owned(),
+        || "does not accept such a value".to_owned(),
         |wanted| format!("is {}", print(wanted)),
     );
     let message = format!(
-        "`{}` is {} here, and in its NodeSet it {is}",
+        "`{}` is {} here, but in its NodeSet it {is}",
         short(&id),
         print(value)
     );

@@ -56,11 +56,11 @@ pub(super) fn check(
                 && (first.message_type.is_none() || first.message_type == message_type)
         });
         if let Some((first, place)) = first {
-            let message = format!("the pattern `{}` is there already", first.topics());
+            let message = format!("the pattern `{}` is repeated", first.topics());
             let label = format!("first at {}", findings.line(*place, at.place));
             let note = findings.warning(Code::TopicPattern, at.place, message);
             note.label(label)
-                .help("the first pattern that fits a topic counts, so this one has no effect");
+                .help("the first matching pattern applies, so this pattern has no effect");
         }
         places.push(at.place);
         patterns.push(Pattern {
@@ -88,7 +88,7 @@ fn origin_of(
         let message = "space 0 is the OPC UA side and has no ROS topics";
         findings
             .error(Code::OpcUaBinding, place, message)
-            .help("a pattern is about the topics of one ROS space");
+            .help("a pattern matches the topics of a ROS space");
         return None;
     }
     Some(origin)
@@ -114,10 +114,10 @@ fn texts(
     let topics = topics.and_then(|(text, place)| {
         let topics = glob(text, place, findings)?;
         if topics.wildcards() == 0 {
-            let message = format!("`{text}` has no wildcard and is one topic");
+            let message = format!("`{text}` has no wildcard, so it is a single topic");
             findings
                 .error(Code::TopicPattern, place, message)
-                .help("`*` stands for part of a name; one topic is an entry of `variables`");
+                .help("use `*` for a part of the name, or add the topic to `variables`");
             return None;
         }
         Some(topics)
@@ -151,7 +151,7 @@ fn glob(text: &str, place: Place, findings: &mut Findings) -> Option<Glob> {
     match Glob::parse(text) {
         Ok(glob) => Some(glob),
         Err(why) => {
-            let message = format!("`{}` is no pattern of topic names", short(text));
+            let message = format!("`{}` is not a pattern of topic names", short(text));
             findings
                 .error(Code::TopicPattern, place, message)
                 .label(why);
@@ -169,10 +169,12 @@ fn template(
     match Template::parse(text, captures) {
         Ok(template) => Some(template),
         Err(piece) => {
-            let message = format!("`{}` stands for no wildcard", short(&piece));
+            let message = format!("`{}` does not refer to a wildcard", short(&piece));
             findings
                 .error(Code::PatternCapture, place, message)
-                .help(format!("the pattern has {captures}: {{1}} is the first"));
+                .help(format!(
+                    "the pattern has {captures}: {{1}} refers to the first"
+                ));
             None
         }
     }
@@ -190,7 +192,7 @@ fn numbered(
         let message = format!("`{}` is the same for every topic", short(text));
         findings
             .error(Code::PatternCapture, place, message)
-            .help("a node per topic: put what a wildcard stands for into the number, as 10{1}");
+            .help("each topic needs its own node: use the text of a wildcard in the number, such as 10{1}");
         return None;
     }
     Some(template)
@@ -207,18 +209,18 @@ fn node(
     let example = template.render(&vec!["1".to_owned(); captures]);
     let fixed = text.split(';').next().is_some_and(|ns| !ns.contains('{'));
     let Some(node) = example.parse::<NodeIdText>().ok().filter(|_| fixed) else {
-        let message = format!("`{}` makes no node id", short(text));
+        let message = format!("`{}` does not give a node id", short(text));
         findings
             .error(Code::NodeId, place, message)
-            .help("as ns=2;i=10{1}, with an index that is the same for all");
+            .help("use a node id such as ns=2;i=10{1}, with a fixed namespace index");
         return None;
     };
     let index = node.namespace;
     if !alias && node.writer_id().is_none() || index == 0 {
-        let message = format!("`{}` makes no number of a topic", short(text));
+        let message = format!("`{}` does not give the number of a topic", short(text));
         findings
             .error(Code::AliasNeeded, place, message)
-            .help("a node as ns=2;i=10{1}, or beside it `alias: \"10{1}\"`");
+            .help("use a node such as ns=2;i=10{1}, or add `alias: \"10{1}\"`");
         return None;
     }
     if !namespaces.partial && !namespaces.known.contains_key(&index) {
@@ -256,10 +258,10 @@ fn kind(
     };
     let text = at.value.as_ref()?;
     let Ok(name) = text.parse::<TypeName>() else {
-        let message = format!("`{}` is no message type name", short(text));
+        let message = format!("`{}` is not a message type name", short(text));
         findings
             .error(Code::MessageTypeName, at.place, message)
-            .help("package and name, as std_msgs/Bool");
+            .help("give package and name, such as std_msgs/Bool");
         return None;
     };
     let known =

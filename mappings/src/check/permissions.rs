@@ -24,10 +24,10 @@ pub(super) fn of_variable(
     if let Some(write) = &entry.write
         && origin.is_some_and(|origin| origin != SpaceId::UA)
     {
-        let message = "no client writes this variable: its value is produced elsewhere";
+        let message = "clients cannot write this variable: its value is produced in another space";
         findings
             .warning(Code::Permissions, write.place, message)
-            .help("`write` goes with `origin: 0`");
+            .help("`write` requires `origin: 0`");
     }
     let read = roles(&entry.read, findings)?;
     let write = roles(&entry.write, findings)?;
@@ -49,8 +49,12 @@ fn roles(field: &Field<RoleList>, findings: &mut Findings) -> Option<Option<Vec<
     let RoleList(entries) = at.value.as_ref()?;
     if entries.is_empty() {
         findings
-            .error(Code::Permissions, at.place, "without a role nobody may")
-            .help("observer, operator, engineer or security_admin, one or a list");
+            .error(
+                Code::Permissions,
+                at.place,
+                "without a role no user has the permission",
+            )
+            .help("give observer, operator, engineer or security_admin, a single role or a list");
         return None;
     }
     let mut roles = Vec::new();
@@ -60,7 +64,7 @@ fn roles(field: &Field<RoleList>, findings: &mut Findings) -> Option<Option<Vec<
             let message = format!("the role {} is listed twice", role.name());
             findings
                 .warning(Code::Permissions, entry.place, message)
-                .help("leave it out here");
+                .help("remove it here");
         } else {
             roles.push(role);
         }
@@ -98,18 +102,17 @@ pub(super) fn left_open(entry: &ServerEntry, server: &Server, findings: &mut Fin
             .iter()
             .find(|at| at.value == Some(SecurityEntry::None))
     {
-        let message = "other hosts reach the server, and with None everybody on the way reads and changes what is said";
+        let message = "other hosts can reach the server, and with None messages can be read and changed on the network";
         findings
             .warning(Code::OpenServer, none.place, message)
-            .help("leave out None; without `security` a server that other hosts reach does not offer it");
+            .help("remove None; without `security`, a server that other hosts can reach does not offer it");
     }
     if let Some((AnonymousEntry::Operator | AnonymousEntry::Engineer, place)) =
         given(&entry.anonymous)
     {
-        let message =
-            "other hosts reach the server, and everybody may write and call without a name";
+        let message = "other hosts can reach the server, and anonymous users may write and call";
         findings
             .warning(Code::OpenServer, place, message)
-            .help("`ua-server user add NAME --role operator` makes a user who may");
+            .help("add a user with this permission: `ua-server user add NAME --role operator`");
     }
 }

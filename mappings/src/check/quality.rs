@@ -25,9 +25,9 @@ pub(super) fn check(
             .error(
                 Code::Quality,
                 at.place,
-                "the server has this value from its clients, and it does not age",
+                "the value comes from clients of the server, so it does not become stale",
             )
-            .help("`quality` goes with values of other spaces, and with those that come `from` a server");
+            .help("`quality` requires a value of another space, or a value with `from`");
         return None;
     }
     let ages = Ages {
@@ -50,17 +50,17 @@ pub(super) fn check(
             .warning(
                 Code::Quality,
                 place,
-                "the value is sent on change only, so one that stays the same is taken for old",
+                "the value is sent only on change, so an unchanged value is considered stale",
             )
-            .help("leave `publish: on_change` and `deadband` out, or `uncertain_after`");
+            .help("remove `publish: on_change` and `deadband`, or `uncertain_after`");
     } else if publish.period >= after {
         let message = format!(
-            "at most every {:?} a value is sent, and after {after:?} it is taken for old",
+            "a value is sent at most every {:?}, but considered stale after {after:?}",
             publish.period
         );
         findings
             .error(Code::Quality, place, message)
-            .help("a longer time, or leave `at_most` out");
+            .help("use a longer time, or remove `at_most`");
         return None;
     }
     Some(ages)

@@ -48,9 +48,9 @@ pub(super) fn check(
                     .error(
                         Code::RemoteNode,
                         at.place,
-                        "a value of several fields goes to no node",
+                        "a value with several fields cannot be written to a node",
                     )
-                    .help("bind one `field` of the message, or write it `as: bytes`");
+                    .help("bind one `field` of the message, or use `as: bytes`");
                 return None;
             }
             if let Some(from) = &from
@@ -61,9 +61,9 @@ pub(super) fn check(
                     .error(
                         Code::RemoteNode,
                         at.place,
-                        "the value goes to the node it comes from",
+                        "the value is written to the node that it comes from",
                     )
-                    .help("leave `to` out");
+                    .help("remove `to`");
                 return None;
             }
             Some(target)
@@ -84,28 +84,28 @@ fn may_come(entry: &VariableEntry, subject: &Subject<'_>, findings: &mut Finding
     };
     if let Some(origin) = subject.origin.filter(|origin| *origin != SpaceId::UA) {
         let at = entry.origin.as_ref().map_or(place, |at| at.place);
-        let message = format!("the value comes from an OPC UA server, and not from space {origin}");
+        let message = format!("the value comes from an OPC UA server, not from space {origin}");
         fault(at, message, "origin: 0");
     } else if subject.produced {
         fault(
             place,
-            "the value comes from a node, and from a service of ROS too".to_owned(),
-            "leave one of them out",
+            "the value comes from a node and from a ROS service".to_owned(),
+            "remove one of them",
         );
     }
     if subject.node.is_some_and(|node| node.namespace == 0) {
         let at = entry.node.as_ref().map_or(place, |at| at.place);
         fault(
             at,
-            "the cell's server shows no such value in namespace 0".to_owned(),
-            "take a node of a namespace of `namespaces`",
+            "the server of the cell shows no such value in namespace 0".to_owned(),
+            "use a node of a namespace of `namespaces`",
         );
     }
     if entry.ua_field.is_some() {
         fault(
             place,
-            "the value comes from a node, and not from a publisher with several fields".to_owned(),
-            "leave `ua_field` out",
+            "the value comes from a node, not from a publisher with several fields".to_owned(),
+            "remove `ua_field`",
         );
     }
     let deadband = entry.from.as_ref().and_then(|at| at.value.as_ref());
@@ -114,8 +114,8 @@ fn may_come(entry: &VariableEntry, subject: &Subject<'_>, findings: &mut Finding
             .value_type
             .is_some_and(|(builtin, array)| array || !messages::is_number(builtin))
     {
-        let message = "a deadband of a server goes with a single number".to_owned();
-        fault(at, message, "leave it out: every change is told");
+        let message = "a deadband of a server requires a single number".to_owned();
+        fault(at, message, "remove it: the server reports every change");
     }
     sound
 }

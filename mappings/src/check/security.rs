@@ -47,11 +47,11 @@ pub(super) fn check(
         };
         if let Some(first) = ids.insert(group.id.clone(), at.place) {
             let line = findings.line(first, at.place);
-            let message = format!("the group `{}` is there twice", short(&group.id));
+            let message = format!("the group `{}` is listed twice", short(&group.id));
             findings
                 .error(Code::SecurityGroup, at.place, message)
                 .label(format!("first at {line}"))
-                .help("one entry with all its namespaces");
+                .help("use one entry with all its namespaces");
             continue;
         }
         claim(entry, at.place, &mut taken, findings);
@@ -82,7 +82,7 @@ fn claim(
         let line = findings.line(first, place);
         let message = match namespace {
             Some(namespace) => format!("namespace {namespace} is in two groups"),
-            None => "two groups are without `namespaces`".to_owned(),
+            None => "two groups have no `namespaces`".to_owned(),
         };
         findings
             .error(Code::SecurityGroup, place, message)
@@ -98,7 +98,7 @@ fn group(
 ) -> Option<SecurityGroup> {
     let (id, place) = required(&entry.group, "group", "the entry", owner, findings)?;
     if id.is_empty() || id.chars().count() > 128 || id.chars().any(char::is_control) {
-        let message = "a SecurityGroupId has 1 to 128 characters, none a control character";
+        let message = "a SecurityGroupId has 1 to 128 characters without control characters";
         findings.error(Code::SecurityGroup, place, message);
         return None;
     }
@@ -121,7 +121,7 @@ fn group(
     for at in namespaces.unwrap_or_default() {
         match at.value {
             Some(0) => {
-                let message = "namespace 0 is that of OPC UA itself, and no WriterGroupId";
+                let message = "namespace 0 belongs to OPC UA and is not a WriterGroupId";
                 findings.error(Code::SecurityGroup, at.place, message);
             }
             Some(namespace) => listed.push(namespace),
@@ -131,10 +131,10 @@ fn group(
     if let Some(at) = &entry.namespaces
         && at.value.as_ref().is_some_and(Vec::is_empty)
     {
-        let message = "a group with an empty list of namespaces is about nothing";
+        let message = "a group with an empty list of namespaces has no effect";
         findings
             .error(Code::SecurityGroup, at.place, message)
-            .help("without the key it has all that no other group names");
+            .help("without this key the group has all namespaces that no other group lists");
     }
     let keys = keys(entry, (mode, owner), server, findings);
     Some(SecurityGroup {
@@ -157,7 +157,9 @@ fn keys(
         if mode != GroupMode::None {
             findings
                 .error(Code::GroupKeys, owner, "a secured group without `keys`")
-                .help("keys: {file: cell.keys}, which `ua-space keys cell.keys` makes");
+                .help(
+                    "add keys: {file: cell.keys}, and make the file with `ua-space keys cell.keys`",
+                );
         }
         return None;
     };
@@ -167,9 +169,9 @@ fn keys(
             .error(
                 Code::GroupKeys,
                 at.place,
-                "keys of a group that is not secured",
+                "the group has keys, but is not secured",
             )
-            .help("leave out `mode: none`, or the keys");
+            .help("remove `mode: none`, or the keys");
         return None;
     }
     source(keys, at.place, server, findings)
@@ -189,16 +191,16 @@ fn source(
             .error(
                 Code::GroupKeys,
                 place,
-                "keys come from exactly one of `file`, `credential` and `sks`",
+                "`keys` needs exactly one of `file`, `credential` and `sks`",
             )
-            .help("the keys themselves never stand in the mapping: whoever can read it would have them");
+            .help("keys cannot be part of the mapping, because every reader of the mapping would have them");
         return None;
     }
     if let Some((file, place)) = given(&keys.file) {
         if file.is_empty() || is_key(file) {
             findings
-                .error(Code::GroupKeys, place, "this is no file")
-                .help("the keys stand in a file of their own that only its owner can read (chmod 600)");
+                .error(Code::GroupKeys, place, "this is not a file name")
+                .help("put the keys into a separate file that only its owner can read (chmod 600)");
             return None;
         }
         return Some(KeySource::File(PathBuf::from(file)));
@@ -206,8 +208,12 @@ fn source(
     if let Some((name, place)) = given(&keys.credential) {
         if name.is_empty() || name.contains('/') || name.starts_with('.') || is_key(name) {
             findings
-                .error(Code::GroupKeys, place, "this is no name of a credential")
-                .help("the ID in LoadCredential=ID:PATH of the unit");
+                .error(
+                    Code::GroupKeys,
+                    place,
+                    "this is not the name of a credential",
+                )
+                .help("use the ID in LoadCredential=ID:PATH of the unit");
             return None;
         }
         return Some(KeySource::Credential(name.clone()));
@@ -228,7 +234,7 @@ fn service(
         let message = format!("a key is used for {LEAST_LIFETIME:?} at least, not {short:?}");
         findings
             .error(Code::KeyService, at, message)
-            .help("programs ask again at half of it, and each has to have the next key in time");
+            .help("programs request keys at half of the lifetime, and every program needs the next key in time");
     }
     let members = entry.members.as_ref().and_then(|at| at.value.as_deref());
     let members: Vec<String> = members
@@ -247,10 +253,10 @@ fn service(
         return entry.endpoint.is_none().then(own);
     };
     let Some(endpoint) = Endpoint::parse(text) else {
-        let message = format!("`{}` is no endpoint", short(text));
+        let message = format!("`{}` is not an endpoint", short(text));
         findings
             .error(Code::Endpoint, at, message)
-            .help("for example opc.tcp://sks.local:4840");
+            .help("use an endpoint such as opc.tcp://sks.local:4840");
         return None;
     };
     if endpoint == *server {
@@ -261,9 +267,9 @@ fn service(
             .error(
                 Code::KeyService,
                 place,
-                "`key_lifetime` and `members` are that service's own affair",
+                "`key_lifetime` and `members` belong to the other service",
             )
-            .help("they go with the cell's own server: sks: {}");
+            .help("use them only with the server of the cell: sks: {}");
         return None;
     }
     Some(KeySource::Sks(endpoint))
@@ -280,11 +286,12 @@ pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut F
     for namespace in mapping.namespaces().keys() {
         if mapping.group_of(*namespace).is_none() {
             let message = format!(
-                "namespace {namespace} is in no group: anybody can write and read its values"
+                "namespace {namespace} is not in a group: every host of the network can read and write its values"
             );
             findings
                 .warning(Code::HalfSecured, at.place, message)
-                .help("a group without `namespaces` has all that no other names; `mode: none` says that it is meant");
+                .help("a group without `namespaces` has all namespaces that no other group lists; confirm \
+                       an unsecured namespace with `mode: none`");
         }
     }
     for call in mapping.calls() {
@@ -293,17 +300,18 @@ pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut F
         if open {
             let call_place = place_of(document, call).unwrap_or(at.place);
             let message = format!(
-                "the call {} is in no secured group, and others are: anybody on this host can ask for it{}",
+                "the call {} is not in a secured group, but other namespaces are: every program of this \
+                 host can request the call{}",
                 short(&call.name),
                 if call.open {
-                    ", and anybody on the network"
+                    ", and every host of the network"
                 } else {
                     ""
                 }
             );
             findings
                 .warning(Code::OpenCall, call_place, message)
-                .help("put its namespace into a secured group");
+                .help("add its namespace to a secured group");
         }
     }
 }
@@ -326,23 +334,23 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
     }
     if server.policies(server.endpoint.is_loopback()) == [SecurityPolicy::None] {
         let message = format!(
-            "the server makes the keys of the group `{}`, and hands them out over encrypted sessions, of which it offers none",
+            "the server provides the keys of the group `{}` over encrypted sessions only, but offers no encryption",
             short(&group.id)
         );
         findings
             .error(Code::KeyService, at.place, message)
-            .help("server: {security: [Basic256Sha256]}");
+            .help("set server: {security: [Basic256Sha256]}");
     }
     if matches!(server.endpoint.host.as_str(), "0.0.0.0" | "::") {
         let message = format!(
-            "programs ask the server for the keys of the group `{}` at `server.endpoint`, and {} is no address that \
-             another host can reach",
+            "programs request the keys of the group `{}` at `server.endpoint`, but other hosts cannot reach {}",
             short(&group.id),
             server.endpoint
         );
-        findings
-            .warning(Code::KeyService, at.place, message)
-            .help("server: {endpoint: \"opc.tcp://NAME:4840\"}, with the name or address of its host; ua-server --endpoint says where it listens");
+        findings.warning(Code::KeyService, at.place, message).help(
+            "set server: {endpoint: \"opc.tcp://NAME:4840\"} with the name or address of its host; \
+                   ua-server --endpoint sets the listening address",
+        );
     }
 }
 
@@ -355,11 +363,11 @@ fn without_members(place: Place, group: &SecurityGroup, server: &Server, finding
         return;
     }
     let message = format!(
-        "the keys of the group `{}` are for the cell's own server and bridges alone: `members` is left out",
+        "only the server and the bridges of the cell get the keys of the group `{}`, because it has no `members`",
         short(&group.id)
     );
     let help = format!(
-        "for components and programs of others list the ApplicationUris in their certificates: sks: {{members: [\"{}\", \
+        "for other programs, list the ApplicationUris of their certificates: sks: {{members: [\"{}\", \
          \"urn:HOST:ua-bridge:bridge-ros1\", \"urn:HOST:ua-bridge:bridge-ros2\"]}}",
         short(&server.application_uri)
     );

@@ -84,10 +84,10 @@ impl Chosen<'_> {
                 shaping.select(field, message_type, (place, way), findings)
             }
             (Some(at), AsEntry::Bytes) => {
-                let message = "a message that crosses as bytes has no fields";
+                let message = "a message that is transferred as bytes has no fields";
                 findings
                     .error(Code::FieldOfBytes, at.place, message)
-                    .help("leave `field` out, or `as: bytes`");
+                    .help("remove `field`, or `as: bytes`");
                 None
             }
             (Some(at), AsEntry::Structure) => {

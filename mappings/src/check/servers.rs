@@ -83,7 +83,7 @@ fn server(
     let skills = skills(entry, namespaces, numbers, findings);
     let user = user(entry, findings)?;
     if let (Some((SecurityPolicy::None, place)), Some(_)) = (security, &user) {
-        let message = "the password of a user goes over a session without security";
+        let message = "the password of a user is sent in a session without security";
         findings
             .warning(Code::OpenUser, place, message)
             .help("security: Basic256Sha256");
@@ -104,7 +104,7 @@ fn server(
 
 /// Returns the place of the server's skills in the space. `None` for a faulty entry, which is
 /// noted.
-#[expect(clippy::option_option, reason = "faulty, left out, or there")]
+#[expect(clippy::option_option, reason = "faulty, left out or present")]
 fn skills(
     entry: &RemoteServerEntry,
     namespaces: &Namespaces,
@@ -117,7 +117,8 @@ fn skills(
     };
     let Some(at) = &entry.skills else {
         if let Some(open) = &entry.open {
-            let message = "`open` without `skills`: it says who may have skills of the server run";
+            let message =
+                "`open` requires `skills`: it controls which hosts may run skills of the server";
             findings.error(Code::Servers, open.place, message);
             return None;
         }
@@ -125,17 +126,18 @@ fn skills(
     };
     let (namespace, place) = (*at.value.as_ref()?, at.place);
     if !namespaces.known.contains_key(&namespace) && !namespaces.partial {
-        let message = format!("the skills are in namespace {namespace}, which is not listed");
+        let message =
+            format!("the skills are in namespace {namespace}, which `namespaces` does not list");
         findings
             .error(Code::UndeclaredNamespace, place, message)
             .help(format!(
-                "namespaces: {{{namespace}: urn:...}}, with the ApplicationUri of the server"
+                "add namespaces: {{{namespace}: urn:...}} with the ApplicationUri of the server"
             ));
         return None;
     }
     if let Some(first) = numbers.insert(namespace, place) {
         let line = findings.line(first, place);
-        let message = format!("the skills of another server are in namespace {namespace} too");
+        let message = format!("the skills of another server are also in namespace {namespace}");
         findings
             .error(Code::Servers, place, message)
             .label(format!("first at {line}"))
@@ -174,12 +176,12 @@ pub(super) fn alone(
             .find(|(topic, _)| topic.space == SpaceId::UA && topic.namespace.get() == *namespace);
         if let (true, Some((topic, name))) = (is_in, other) {
             let message = format!(
-                "namespace {namespace} is that of the skills of a server, and `{}` ({topic}) is in it",
+                "namespace {namespace} belongs to the skills of a server, but `{}` ({topic}) is in it",
                 short(name)
             );
             findings
                 .error(Code::Servers, place, message)
-                .help("give the skills a namespace that nothing else is in");
+                .help("give the skills a namespace of their own");
         }
     }
 }
@@ -189,9 +191,9 @@ fn name_of(name: &str, place: Place, findings: &mut Findings) -> Option<String> 
     if !name.is_empty() && name.len() <= 64 && name.chars().all(plain) {
         return Some(name.to_owned());
     }
-    let message = format!("`{}` is no name of a server", short(name));
+    let message = format!("`{}` is not the name of a server", short(name));
     let note = findings.error(Code::Servers, place, message);
-    note.help("1 to 64 letters, digits, `_`, `-` and `.`, as plc or press_2");
+    note.help("use 1 to 64 letters, digits, `_`, `-` and `.`, such as plc or press_2");
     None
 }
 
@@ -204,15 +206,16 @@ fn other_endpoint(
     let endpoint = remote_endpoint(text, place, findings)?;
     if is_own(&endpoint, own) {
         findings
-            .error(Code::Servers, place, "the endpoint is that of the cell's own server")
-            .help("the cell's server shows what is in the cell; give it another `server.endpoint`, or name another server here");
+            .error(Code::Servers, place, "the endpoint belongs to the server of the cell")
+            .help("give another server here, or change `server.endpoint`: the server of the cell already \
+                   shows the cell");
         return None;
     }
     Some(endpoint)
 }
 
 /// Returns `None` for a faulty entry, which is noted.
-#[expect(clippy::option_option, reason = "faulty, left out, or there")]
+#[expect(clippy::option_option, reason = "faulty, left out or present")]
 fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<User>> {
     match (&entry.user, &entry.password) {
         (None, None) => Some(None),
@@ -220,15 +223,15 @@ fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<Use
             let (name, text) = (user.value.as_ref()?, password.value.as_ref()?);
             if name.is_empty() || name.len() > 256 {
                 findings
-                    .error(Code::Servers, user.place, "no user has such a name")
-                    .help("1 to 256 bytes; without `user` the session is anonymous");
+                    .error(Code::Servers, user.place, "the user name is not valid")
+                    .help("use 1 to 256 bytes; without `user` the session is anonymous");
                 return None;
             }
             // The password is empty here if only the environment of another program has it.
             if !text.is_empty() && !findings.is_hidden(text) {
                 findings
-                    .warning(Code::Secret, password.place, "a password stands here in plain text")
-                    .help("write it as ${NAME:-}: the environment of ua-server has it, and other programs need none");
+                    .warning(Code::Secret, password.place, "this is a password in plain text")
+                    .help("write ${NAME:-}, and set the variable for ua-server only; other programs do not need it");
             }
             Some(Some(User {
                 name: name.clone(),
@@ -236,14 +239,14 @@ fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<Use
             }))
         }
         (Some(one), None) => {
-            let message = "a user without a `password`";
+            let message = "the user has no `password`";
             findings
                 .error(Code::Servers, one.place, message)
-                .help("password: ${PLC_PASSWORD:-}");
+                .help("add password: ${PLC_PASSWORD:-}");
             None
         }
         (None, Some(one)) => {
-            let message = "a password without a `user`";
+            let message = "the password has no `user`";
             findings.error(Code::Servers, one.place, message);
             None
         }
@@ -285,9 +288,9 @@ pub(super) fn node(
     match text.parse() {
         Ok(node) => Some(node),
         Err(error) => {
-            let message = format!("`{}` is no node id", short(text));
+            let message = format!("`{}` is not a node id", short(text));
             findings.error(Code::NodeId, place, message).help(format!(
-                "{error}; of another server best with the URI of its namespace, as nsu=urn:plc;s=Line.Reset"
+                "{error}; for another server, prefer the namespace URI, such as nsu=urn:plc;s=Line.Reset"
             ));
             None
         }
@@ -333,7 +336,7 @@ pub(super) fn source(
             if sound.is_none() {
                 findings
                     .error(Code::Publish, place, format!("a deadband of {width}"))
-                    .help("a number above 0, in the unit of the value");
+                    .help("give a number above 0, in the unit of the value");
             }
             sound
         }

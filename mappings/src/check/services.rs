@@ -131,10 +131,10 @@ fn check_when(
     let fits = |carrier| Plan::compile(&carrier, &template, wire(dialect)).is_ok();
     if !carrier.is_some_and(fits) {
         let told = types::print(value_type);
-        let message = format!("`{}` is no value of type {told}", short(text));
+        let message = format!("`{}` is not a value of type {told}", short(text));
         findings
             .error(Code::When, place, message)
-            .help("a Boolean, number or text of the variable's type");
+            .help("use a Boolean, number or text of the type of the variable");
     }
 }
 
@@ -195,15 +195,15 @@ pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) 
     let Some((kind, _)) = said.next() else {
         findings
             .error(Code::MissingKey, owner, "the binding has no `topic`")
-            .help("a topic, or a service under `call`, `answer` or `poll`");
+            .help("add a topic, or a service under `call`, `answer` or `poll`");
         return None;
     };
     if let Some((other, place)) = said.next() {
         let (kind, other) = (kind.key(), other.key());
         let message = format!("a binding has `{kind}` or `{other}`, not both");
-        findings
-            .error(Code::BindingKind, place, message)
-            .help("one binding per space: a second one is a second variable");
+        findings.error(Code::BindingKind, place, message).help(
+            "a variable has one binding per space: add a second variable for the other binding",
+        );
         return None;
     }
     let place = |at: &Field<String>| at.as_ref().map(|at| at.place);
@@ -222,7 +222,7 @@ pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) 
     let mut sound = Some(kind);
     for (key, place, refused) in strange {
         if let (Some(place), true) = (place, refused) {
-            let message = format!("`{key}` does not go with `{}`", kind.key());
+            let message = format!("`{key}` cannot be combined with `{}`", kind.key());
             findings.error(Code::BindingKind, place, message);
             sound = None;
         }
@@ -262,13 +262,15 @@ fn space_of(kind: Kind, site: &Site<'_>, findings: &mut Findings) -> Option<Spac
     let (space, origin) = (site.space?, site.subject.origin);
     let (message, help) = if kind == Kind::Call && origin == Some(space) {
         (
-            format!("the value comes from space {space}, and cannot call a service of it"),
-            "`call` is for values of other spaces; a value that is asked for has a `poll`",
+            format!(
+                "the value comes from space {space}, so it cannot call a service of this space"
+            ),
+            "`call` requires a value of another space; use `poll` for a value that the service returns",
         )
     } else if kind != Kind::Call && origin.is_some_and(|origin| origin != space) {
         (
-            format!("what a service of space {space} answers is a value of that space"),
-            "give the variable the `origin` of the service",
+            format!("the response of a service of space {space} is a value of this space"),
+            "set `origin` to the space of the service",
         )
     } else {
         return Some(space);
@@ -287,17 +289,17 @@ fn answer(
 ) -> Option<Checked> {
     let (text, place) = given(&entry.answer)?;
     let Ok(node) = text.parse::<NodeIdText>() else {
-        let message = format!("`{}` is no node id", short(text));
+        let message = format!("`{}` is not a node id", short(text));
         findings
             .error(Code::NodeId, place, message)
-            .help("the node of the variable with the `call`, as ns=2;i=20");
+            .help("give the node of the variable with the `call`, such as ns=2;i=20");
         return None;
     };
     let Some(call) = known.calls.0.get(&node) else {
         let message = format!("no variable with a `call` has the node `{}`", short(text));
         findings
             .error(Code::Answer, place, message)
-            .help("name the node of the variable whose values call the service");
+            .help("give the node of the variable whose values call the service");
         return None;
     };
     let service = call.service_type.as_ref().and_then(|name| {
@@ -352,10 +354,10 @@ fn asked(
                 fields = Some(found);
             }
             if let Some(at) = &entry.when {
-                let message = "`when` does not go with `field`: each value is sent";
+                let message = "`when` cannot be combined with `field`: each value is sent";
                 findings
                     .error(Code::When, at.place, message)
-                    .help("leave `field` out to send the same request each time");
+                    .help("remove `field` to send the same request each time");
             }
         } else {
             chosen.converts_nothing(findings)?;
@@ -395,16 +397,16 @@ fn service_type(
         let message = format!("the binding has a `{}` and no `type`", kind.key());
         findings
             .error(Code::MissingKey, owner, message)
-            .help("the type of the service, as std_srvs/SetBool");
+            .help("give the type of the service, such as std_srvs/SetBool");
         return None;
     };
     let text = at.value.as_ref()?;
     let name = type_name(text);
     if name.is_none() {
-        let message = format!("`{}` is no service type name", short(text));
+        let message = format!("`{}` is not a service type name", short(text));
         findings
             .error(Code::MessageTypeName, at.place, message)
-            .help("package and name, as std_srvs/SetBool");
+            .help("give package and name, such as std_srvs/SetBool");
     }
     Some((name?, at.place))
 }
@@ -432,8 +434,8 @@ pub(super) fn built_in(
                 Dialect::Ros2 => "a prefix in AMENT_PREFIX_PATH",
             };
             let why = format!(
-                "a package with its .srv file must be in `type_paths` or below {folders} when the bridge runs, and fields \
-                 are checked then{looked}"
+                "add a package with its .srv file to `type_paths` or below {folders} before the bridge \
+                 starts; fields are checked then{looked}"
             );
             match types.suggest(dialect, TextKind::Service, name) {
                 Some(near) => format!("did you mean `{near}`? If not: {why}"),
@@ -471,7 +473,7 @@ fn response_field(
         return Some((selection, None));
     };
     if response.leaves().is_empty() {
-        let message = format!("`{}` has no field, so there is no value", response.name());
+        let message = format!("`{}` has no field, so it has no value", response.name());
         findings.error(Code::UnknownField, at.0, message);
         return None;
     }
@@ -504,8 +506,8 @@ fn template(
         let fault = if rest.insert(path.clone(), literal.clone()).is_some() {
             Some((format!("field `{}` is given twice", short(path)), None))
         } else if fields.iter().any(|one| takes(&one.field, path)) {
-            let message = format!("field `{}` takes the value already", short(path));
-            Some((message, Some("leave it out of `request`".to_owned())))
+            let message = format!("field `{}` already takes the value", short(path));
+            Some((message, Some("remove it from `request`".to_owned())))
         } else {
             request.and_then(|request| {
                 let one = Selection::Template {

@@ -30,24 +30,24 @@ pub(super) fn fields(
     ];
     for (key, place) in beside {
         if let Some(place) = place {
-            let message = format!("`{key}` does not go with `fields`");
+            let message = format!("`{key}` cannot be combined with `fields`");
             findings
                 .error(Code::Fields, place, message)
-                .help("leave one of them out");
+                .help("remove one of them");
             return None;
         }
     }
     if list.0.is_empty() {
         findings
-            .error(Code::Fields, at.place, "`fields` names no field")
-            .help("leave it out for the whole message");
+            .error(Code::Fields, at.place, "`fields` is empty")
+            .help("remove it for the whole message");
         return None;
     }
     if list.0.len() > MOST_FIELDS {
-        let message = format!("`fields` names {} fields", list.0.len());
+        let message = format!("`fields` has {} fields", list.0.len());
         findings
             .error(Code::Fields, at.place, message)
-            .help(format!("a variable has at most {MOST_FIELDS} of them"));
+            .help(format!("a variable has at most {MOST_FIELDS} fields"));
         return None;
     }
     let mut all: Vec<Selected> = Vec::new();
@@ -56,8 +56,12 @@ pub(super) fn fields(
         let entry = at.value.as_ref()?;
         let Some((text, place)) = given(&entry.field) else {
             findings
-                .error(Code::MissingKey, at.place, "one of `fields` has no `field`")
-                .help("as {field: linear.x, scale: 1000}");
+                .error(
+                    Code::MissingKey,
+                    at.place,
+                    "an entry of `fields` has no `field`",
+                )
+                .help("write it such as {field: linear.x, scale: 1000}");
             return None;
         };
         let field = shaping::part(text, place, findings)?;
@@ -71,7 +75,7 @@ pub(super) fn fields(
         let one = shaping.select(field, message_type, (place, way), findings)?;
         let one = selected(one)?.pop()?;
         if !known.insert((one.field.clone(), one.part.clone())) {
-            let message = format!("`{}` is named twice", short(text));
+            let message = format!("`{}` is listed twice", short(text));
             findings.error(Code::Fields, place, message);
             return None;
         }
@@ -131,7 +135,7 @@ pub(super) fn leaves(
     }
     if !way.reads && !places.is_sorted_by(|a, b| a < b) {
         let message = format!(
-            "the fields do not stand in the order that `{}` has them",
+            "the fields are not in the order of `{}`",
             message_type.name()
         );
         let paths: Vec<&str> = message_type
@@ -146,7 +150,7 @@ pub(super) fn leaves(
                 selected.iter().any(under)
             })
             .collect();
-        let help = format!("here they are {}", super::bindings::told(&paths));
+        let help = format!("the order here is {}", super::bindings::told(&paths));
         findings.error(Code::FieldOrder, place, message).help(help);
         return None;
     }
@@ -168,10 +172,13 @@ pub(super) fn structure(
         }]);
     }
     selection::field(message_type, path, place, findings)?;
-    let message = format!("`{}` is no message, so it is no structure", short(path));
+    let message = format!(
+        "`{}` is not a message, so it cannot be a structure",
+        short(path)
+    );
     findings
         .error(Code::StructureOf, place, message)
-        .help("leave `field` out for the whole message, or `as: structure`");
+        .help("remove `field` for the whole message, or remove `as: structure`");
     None
 }
 
@@ -181,12 +188,12 @@ pub(super) fn compare(a: &Binding, b: &Binding, place: Place, findings: &mut Fin
         && a.message_type != b.message_type
     {
         let message = format!(
-            "a structure of `{}` in space {} is no `{}` in space {}",
+            "a structure of `{}` in space {} is not a `{}` in space {}",
             a.message_type, a.space, b.message_type, b.space
         );
         findings
             .error(Code::StructureOf, place, message)
-            .help("bind the same type on both sides, or leave `as: structure` out");
+            .help("bind the same type on both sides, or remove `as: structure`");
     }
 }
 

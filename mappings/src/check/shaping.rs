@@ -82,10 +82,11 @@ pub(super) fn part(
 ) -> Option<(String, Option<Part>)> {
     let split = Part::split(text);
     if split.is_none() {
-        let message = format!("`{}` is no field and part of an array", short(text));
+        let message = format!("`{}` is not a part of an array field", short(text));
         findings
             .error(Code::FieldPart, place, message)
-            .help("an element as position[2] or position[name=joint_3], several as ranges[0:90]");
+            .help("write an element such as position[2] or position[name=joint_3], several elements such as \
+                   ranges[0:90]");
     }
     split.map(|(field, part)| (field.to_owned(), part))
 }
@@ -103,9 +104,9 @@ pub(super) fn shaping(keys: Keys<'_>, findings: &mut Findings) -> Option<Shaping
             .error(
                 Code::Conversion,
                 place,
-                format!("no value can be scaled by {scale}"),
+                format!("{scale} is not a valid scale"),
             )
-            .help("a number other than 0; to turn a sign, -1");
+            .help("give a number other than 0; use -1 to change the sign");
         sound = None;
     }
     if let Some((offset, place)) = offset
@@ -114,7 +115,7 @@ pub(super) fn shaping(keys: Keys<'_>, findings: &mut Findings) -> Option<Shaping
         findings.error(
             Code::Conversion,
             place,
-            format!("no value can be moved by {offset}"),
+            format!("{offset} is not a valid offset"),
         );
         sound = None;
     }
@@ -136,12 +137,12 @@ pub(super) fn shaping(keys: Keys<'_>, findings: &mut Findings) -> Option<Shaping
             .into_iter()
             .filter_map(|(key, place)| Some((key, place?)));
         if let Some((key, other)) = beside.next() {
-            let message = format!("`{key}` is about numbers, and `invert` about a Boolean");
+            let message = format!("`{key}` requires a number, but `invert` a Boolean");
             let line = findings.line(place, other);
             findings
                 .error(Code::Conversion, other, message)
                 .label(format!("`invert` at {line}"))
-                .help("leave one of them out");
+                .help("remove one of them");
             sound = None;
         }
     }
@@ -176,9 +177,9 @@ impl Shaping {
             let note = findings.error(
                 Code::PartWritten,
                 place,
-                "a part of an array is read, and this topic is written",
+                "a part of an array can only be read, but this topic is written",
             );
-            note.help("what stands in the rest of the array, nobody says: bind the whole field, or a field that is one value");
+            note.help("the rest of the array has no values: bind the whole field, or a field with a single value");
             return None;
         }
         let leaf = message_type.and_then(|message| message.leaf(&field));
@@ -206,8 +207,12 @@ impl Shaping {
             return Some(());
         };
         findings
-            .error(Code::Fields, place, "`fields` are converted one by one")
-            .help("write it to the field: `fields: [{field: linear.x, scale: 1000}]`");
+            .error(
+                Code::Fields,
+                place,
+                "the conversion of `fields` belongs to each field",
+            )
+            .help("move it to the field: `fields: [{field: linear.x, scale: 1000}]`");
         None
     }
 
@@ -220,9 +225,9 @@ impl Shaping {
             .error(
                 Code::Conversion,
                 place,
-                "no value goes into the request, so none is converted",
+                "the request contains no value, so nothing is converted",
             )
-            .help("name the field of the request that takes the value: `field: data`");
+            .help("give the field of the request that takes the value: `field: data`");
         None
     }
 
@@ -235,9 +240,9 @@ impl Shaping {
             .error(
                 Code::Conversion,
                 place,
-                "only one value is converted, and this is a message",
+                "only a single value can be converted, but this is a message",
             )
-            .help("name the value with `field`");
+            .help("select the value with `field`");
         None
     }
 
@@ -270,14 +275,15 @@ impl Shaping {
         if lossy && !self.said {
             let message = match self.scaled && from == into {
                 true => format!("scaled values do not fit {} without rounding", into.name()),
-                false => format!("not every {} fits {}", from.name(), into.name()),
+                false => format!("{} has values that do not fit {}", from.name(), into.name()),
             };
             let help = match way.reads && self.scaled && way.alone && declared.is_none() {
                 true => {
-                    "give the variable a `type: Double`, or say what becomes of a value that does not fit: `out_of_range: refuse` or `clamp`"
+                    "give the variable `type: Double`, or choose how to treat a value that does not fit: \
+                     `out_of_range: refuse` or `clamp`"
                 }
                 false => {
-                    "say what becomes of a value that does not fit, after rounding: `out_of_range: refuse` or `clamp`"
+                    "choose how to treat a value that does not fit after rounding: `out_of_range: refuse` or `clamp`"
                 }
             };
             findings

@@ -242,7 +242,7 @@ fn note(noted: Vec<Noted>, place: Place, findings: &mut Findings) {
             Noted::Refused { file, error, .. } => {
                 findings
                     .warning(Code::DefinitionFile, place, format!("{file}: {error}"))
-                    .help("the file counts as not there; what is built in under the name counts, if anything is");
+                    .help("this file is ignored; the built-in definition of this name is used, if there is one");
             }
             Noted::Differs {
                 name,
@@ -268,10 +268,12 @@ fn note(noted: Vec<Noted>, place: Place, findings: &mut Findings) {
                     sides.join("; ")
                 };
                 let message =
-                    format!("`{name}` of {file} differs from the one that is built in: {sides}");
+                    format!("`{name}` of {file} differs from the built-in definition: {sides}");
                 findings
                     .warning(Code::DefinitionsDiffer, place, message)
-                    .help("the file counts; are the peers built with it, too?");
+                    .help(
+                        "the file is used; check that the peers are built with the same definition",
+                    );
             }
         }
     }

@@ -122,7 +122,7 @@ fn draft<'d>(
     let alias = given(&entry.alias).and_then(|(number, place)| {
         if *number == 0 {
             findings
-                .error(Code::Alias, place, "0 is no alias")
+                .error(Code::Alias, place, "0 is not an alias")
                 .label("1 to 65535");
         }
         NonZeroU16::new(*number)
@@ -153,7 +153,7 @@ pub(super) fn node_id(
     let node: NodeIdText = match text.parse() {
         Ok(node) => node,
         Err(error) => {
-            let message = format!("`{}` is no node id", short(text));
+            let message = format!("`{}` is not a node id", short(text));
             findings
                 .error(Code::NodeId, place, message)
                 .help(error.to_string());
@@ -183,7 +183,7 @@ pub(super) fn space(
     findings: &mut Findings,
 ) -> Option<SpaceId> {
     let Some(id) = SpaceId::new(number) else {
-        let message = format!("{key} {number} is no space");
+        let message = format!("{key} {number} is not a space");
         findings
             .error(Code::SpaceId, place, message)
             .label("0 to 232");
@@ -220,10 +220,10 @@ fn aliases(drafts: &[Draft<'_>], findings: &mut Findings) {
         };
         if let Some(own) = node.writer_id() {
             if let Some((alias, place)) = given(&draft.entry.alias) {
-                let message = format!("node `{node}` needs no alias");
+                let message = format!("node `{node}` does not need an alias");
                 let note = findings.error(Code::Alias, place, message);
                 note.label(format!("{alias} would stand for {own}"))
-                    .help("leave `alias` out: the topic has the node's own number");
+                    .help("remove `alias`: the topic has the number of the node");
             }
             continue;
         }
@@ -261,11 +261,11 @@ fn aliases(drafts: &[Draft<'_>], findings: &mut Findings) {
 fn why_alias(node: &NodeIdText) -> &'static str {
     match node.identifier {
         Identifier::Numeric(_) if node.namespace == 0 => "a node of namespace 0",
-        Identifier::Numeric(0) => "0 is no identifier of a topic",
+        Identifier::Numeric(0) => "0 is not the identifier of a topic",
         Identifier::Numeric(_) => "topics have numbers up to 65535",
-        Identifier::String(_) => "a text, where topics have numbers",
-        Identifier::Guid(_) => "a Guid, where topics have numbers",
-        Identifier::Opaque(_) => "opaque bytes, where topics have numbers",
+        Identifier::String(_) => "topics have numbers, but this is a text",
+        Identifier::Guid(_) => "topics have numbers, but this is a Guid",
+        Identifier::Opaque(_) => "topics have numbers, but these are opaque bytes",
     }
 }
 
@@ -299,7 +299,7 @@ fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
                 format!("node `{}` has two variables", short(&text)),
             );
             note.label(format!("first at {line}"))
-                .help("one node, one origin: give one of them another node");
+                .help("a node has one origin: give one of the variables another node");
         } else if let Some(topic) = draft.topic()
             && let Some(first) = topics.insert(topic, *place)
         {
@@ -315,7 +315,7 @@ fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
                 format!("`{topic}` is mapped twice"),
             );
             note.label(format!("first at {line}"))
-                .help("give one of them another alias");
+                .help("give one of the two another alias");
         }
     }
 }
@@ -434,13 +434,13 @@ fn ua_field(
         || service.is_some_and(|service| is_origin(service.space));
     let fault = if fields > 1 {
         Some((
-            format!("one field is named, and this variable has {fields}"),
-            "bind one `field` of the message, or leave `ua_field` out",
+            format!("`ua_field` selects one field, but this variable has {fields}"),
+            "bind one `field` of the message, or remove `ua_field`",
         ))
     } else if produced {
         Some((
-            "the value comes from a bridge, which sends it alone".to_owned(),
-            "leave `ua_field` out; it is for publishers that are no bridges",
+            "the value comes from a bridge, which sends no other fields with it".to_owned(),
+            "remove `ua_field`; it is for publishers other than bridges",
         ))
     } else {
         None
@@ -465,23 +465,23 @@ fn publish(
         let fault = if *width <= 0.0 || !width.is_finite() {
             Some((
                 format!("a deadband of {width}"),
-                "a number above 0, in the unit of the value",
+                "give a number above 0, in the unit of the value",
             ))
         } else if value_type.is_some_and(|(builtin, _)| !messages::is_number(builtin)) {
             let told = value_type.map(types::print).unwrap_or_default();
             Some((
-                format!("a deadband goes with numbers, and this is {told}"),
-                "`publish: on_change` goes with all values",
+                format!("a deadband requires numbers, but this is {told}"),
+                "use `publish: on_change`, which works with all values",
             ))
         } else if fields.len() > 1 && !fields.iter().any(|leaf| messages::is_number(leaf.builtin)) {
             Some((
-                "a deadband goes with numbers, and none of the fields is one".to_owned(),
-                "`publish: on_change` goes with all values",
+                "a deadband requires numbers, but no field is a number".to_owned(),
+                "use `publish: on_change`, which works with all values",
             ))
         } else if matches!(given(&entry.publish), Some((PublishEntry::Always, _))) {
             Some((
-                "a deadband holds values back, and `publish: always` does not".to_owned(),
-                "leave one of them out",
+                "a deadband suppresses values, but `publish: always` sends every value".to_owned(),
+                "remove one of them",
             ))
         } else {
             None
@@ -496,10 +496,10 @@ fn publish(
         match rate(text) {
             Some(found) => period = found,
             None => {
-                let message = format!("`{}` is no rate", short(text));
+                let message = format!("`{}` is not a rate", short(text));
                 findings
                     .error(Code::Publish, place, message)
-                    .help("from 0.001 Hz to 1000 Hz, as 10 Hz");
+                    .help("give 0.001 Hz to 1000 Hz, such as 10 Hz");
                 sound = None;
             }
         }
@@ -542,24 +542,25 @@ pub(super) fn checked_name(name: &str, place: Place, findings: &mut Findings) ->
     };
     findings
         .error(Code::Name, place, format!("the name {fault}"))
-        .help("a name as ConveyorRunning");
+        .help("use a name such as ConveyorRunning");
     None
 }
 
 fn declared_type(text: &str, place: Place, findings: &mut Findings) -> Option<ValueType> {
     let declared = types::parse_value_type(text);
     if declared.is_none() {
-        let message = format!("`{}` is no OPC UA builtin type", short(text));
+        let message = format!("`{}` is not an OPC UA builtin type", short(text));
         let note = findings.error(Code::ValueType, place, message);
         let ros = text
             .contains('/')
-            .then(|| "a ROS type belongs into the binding under `ros`".to_owned());
+            .then(|| "move a ROS type to the binding under `ros`".to_owned());
         let brackets = if text.contains('[') { "[]" } else { "" };
         let near = types::suggest_value_type(text);
         let near = near.map(|near| format!("did you mean `{near}{brackets}`?"));
         note.help(
-            ros.or(near)
-                .unwrap_or_else(|| "for example Boolean, Int32, Double[], String".to_owned()),
+            ros.or(near).unwrap_or_else(|| {
+                "use a type such as Boolean, Int32, Double[] or String".to_owned()
+            }),
         );
     }
     declared

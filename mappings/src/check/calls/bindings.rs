@@ -70,12 +70,12 @@ pub(super) fn kind_of(
         return Some(kind);
     };
     let message = match entry.opcua {
-        Some(_) => "a Method is asked for by a service, as it has its answer at once".to_owned(),
+        Some(_) => "a Method is requested by a service, because it returns at once".to_owned(),
         None => "the call has a service and an action".to_owned(),
     };
     findings
         .error(Code::CallBinding, other.place, message)
-        .help("all under `ros` of a call are services, or all are actions");
+        .help("use only services, or only actions, under `ros` of a call");
     None
 }
 
@@ -99,7 +99,7 @@ impl Checker<'_> {
                     let message = format!("the call has two {kind}s in space {}", found.space);
                     findings
                         .error(Code::CallExecutor, at.place, message)
-                        .help("leave one of them out");
+                        .help("remove one of them");
                     return None;
                 }
                 Some(found)
@@ -190,10 +190,10 @@ impl Checker<'_> {
             None => (origin?, place),
         };
         if id == SpaceId::UA {
-            let message = "space 0 is the OPC UA side and has no services of ROS";
+            let message = "space 0 is the OPC UA side, which has no ROS services";
             findings
                 .error(Code::OpcUaBinding, at, message)
-                .help("say whose service it is with `space`");
+                .help("give the `space` of the service");
             return None;
         }
         Some(id)
@@ -218,13 +218,13 @@ fn kind(entry: &CallBindingEntry, owner: Place, findings: &mut Findings) -> Opti
             let message = "a binding has `service` or `action`, not both";
             findings
                 .error(Code::CallBinding, action.place, message)
-                .help("each is a call of its own");
+                .help("add a separate call for each");
             return None;
         }
         (None, None) => {
             findings
                 .error(Code::MissingKey, owner, "the binding has no `service`")
-                .help("the name of a service, or of an action under `action`");
+                .help("give the name of a service, or of an action under `action`");
             return None;
         }
     };
@@ -237,7 +237,7 @@ fn kind(entry: &CallBindingEntry, owner: Place, findings: &mut Findings) -> Opti
                 CallKind::Service => "`request` and `response` do",
                 CallKind::Action => "`goal`, `feedback` and `result` do",
             };
-            let message = format!("`{key}` does not go with `{}`", kind.word());
+            let message = format!("`{key}` cannot be combined with `{}`", kind.word());
             findings
                 .error(Code::CallBinding, place, message)
                 .help(known);
@@ -278,10 +278,10 @@ fn type_name(
         ),
     };
     if name.is_none() {
-        let message = format!("`{}` is no {} type name", short(text), kind.word());
+        let message = format!("`{}` is not a {} type name", short(text), kind.word());
         findings
             .error(Code::MessageTypeName, place, message)
-            .help(format!("package and name, as {example}"));
+            .help(format!("give package and name, such as {example}"));
     }
     Some((name?, place))
 }
@@ -309,8 +309,8 @@ fn action(
         findings
             .warning(Code::UnknownActionType, place, message)
             .help(format!(
-                "a package with its .action file must be in `type_paths` or below {folders} when the bridge runs, and \
-                 fields are checked then{looked}"
+                "add a package with its .action file to `type_paths` or below {folders} before the bridge \
+                 starts; fields are checked then{looked}"
             ));
     }
     known

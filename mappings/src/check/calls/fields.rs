@@ -58,7 +58,7 @@ pub(super) fn compare(executes: Option<&Found>, asks: &Found, findings: &mut Fin
         let place = part.map.map_or(asks.place, |(_, place)| *place);
         let (key, _) = part.key;
         findings.error(Code::CallMap, place, message).help(format!(
-            "say what it is made of: `{key}: {{a: {{field: b}}, c: 1}}`"
+            "list the sources of the fields: `{key}: {{a: {{field: b}}, c: 1}}`"
         ));
     }
 }
@@ -130,7 +130,7 @@ impl Part<'_> {
         })?;
         let source = &source.target.type_name;
         Some(format!(
-            "the {key} of `{name}` cannot be made of that of `{source}`: {fault}"
+            "cannot make the {key} of `{name}` from the {key} of `{source}`: {fault}"
         ))
     }
 
@@ -150,7 +150,7 @@ impl Part<'_> {
         if self.asked {
             let fits = is_value(leaf, &literal);
             let kind = types::print(types::value_type(leaf));
-            return (!fits).then(|| format!("`{told}` is {kind}, and its constant is none"));
+            return (!fits).then(|| format!("`{told}` is {kind}, but its constant is not"));
         }
         let one = Selection::Template {
             fields: Vec::new(),
@@ -171,9 +171,9 @@ impl Part<'_> {
         let mut sources = given.leaves().iter();
         let source = sources.find(|source| source.path.eq_ignore_ascii_case(&path));
         match source {
-            None => Some(format!("`{told}` ({wanted}) is made of nothing")),
+            None => Some(format!("`{told}` ({wanted}) has no source")),
             Some(source) if types::value_type(source) != types::value_type(leaf) => Some(format!(
-                "`{told}` is {wanted}, and `{}` {}",
+                "`{told}` is {wanted}, but `{}` {}",
                 self.told(&path),
                 types::print(types::value_type(source))
             )),
@@ -187,7 +187,7 @@ impl Part<'_> {
             let mut targets = message.leaves().iter();
             !targets.any(|target| target.path.eq_ignore_ascii_case(&source.path))
         })?;
-        Some(format!("nothing is made of `{}`", self.told(&lost.path)))
+        Some(format!("`{}` is not used", self.told(&lost.path)))
     }
 
     /// Returns a path as the mapping writes it.

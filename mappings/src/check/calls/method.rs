@@ -36,19 +36,19 @@ impl Checker<'_> {
         if let Some((origin, at)) = origin
             && origin != SpaceId::UA
         {
-            let message = format!("the call is executed in space {origin}, and not by a Method");
+            let message = format!("the call is executed in space {origin}, not by a Method");
             findings
                 .error(Code::MethodTarget, at, message)
-                .help("the cell's OPC UA server calls Methods: `origin: 0`");
+                .help("the OPC UA server of the cell calls Methods: set `origin: 0`");
             sound = false;
         }
         if let Some((node, at)) = node
             && node.namespace == 0
         {
-            let message = "the cell's server shows no Method in namespace 0";
+            let message = "the server of the cell shows no Method in namespace 0";
             findings
                 .error(Code::MethodTarget, *at, message)
-                .help("take a node of a namespace of `namespaces`");
+                .help("use a node of a namespace of `namespaces`");
             sound = false;
         }
         match target {
@@ -95,13 +95,13 @@ impl Checker<'_> {
             (Some(_), Some(at)) => {
                 findings
                     .error(Code::MethodTarget, at.place, "a server and an endpoint")
-                    .help("`server` says where it is: leave `endpoint` out");
+                    .help("`server` already gives the address: remove `endpoint`");
                 None
             }
             (None, None) => {
                 findings
                     .error(Code::MissingKey, place, "`opcua` has no `server`")
-                    .help("the name of one of `servers`, or an `endpoint`");
+                    .help("give the name of one of `servers`, or an `endpoint`");
                 None
             }
         }
@@ -110,10 +110,11 @@ impl Checker<'_> {
     fn endpoint(&self, text: &str, place: Place, findings: &mut Findings) -> Option<Endpoint> {
         let endpoint = remote_endpoint(text, place, findings)?;
         if is_own(&endpoint, self.known.server) {
-            let message = "the endpoint is that of the cell's own server";
-            findings
-                .error(Code::MethodTarget, place, message)
-                .help("the server shows what is executed in the cell; name the server that has the Method");
+            let message = "the endpoint belongs to the server of the cell";
+            findings.error(Code::MethodTarget, place, message).help(
+                "give the server that has the Method; the server of the cell shows calls that are \
+                       executed in the cell",
+            );
             return None;
         }
         Some(endpoint)

@@ -36,9 +36,9 @@ pub(super) fn check(
             if let Some((_, Some(why))) = asked.find(|(method, _)| method == target) {
                 let named = given(&entry.opcua).and_then(|(target, _)| given(&target.method));
                 let place = named.map_or(place, |(_, place)| place);
-                findings.warning(Code::MethodAway, place, why.clone()).help(
-                    "the call is offered while the server has the Method, and comes when it does",
-                );
+                findings
+                    .warning(Code::MethodAway, place, why.clone())
+                    .help("the call is offered only while the server has the Method");
             }
         }
         ExecutedBy::Elsewhere => {}
@@ -51,10 +51,13 @@ pub(super) fn check(
         let name = &binding.target.name;
         if there.contains_key(name.as_str()) {
             let word = call.kind.word();
-            let message = format!("somebody else offers the {word} `{}` now", short(name));
+            let message = format!(
+                "another node offers the {word} `{}` at the moment",
+                short(name)
+            );
             findings
                 .warning(Code::NameTaken, at(binding.space), message)
-                .help("clients would be answered by the one or by the other: take another name");
+                .help("clients would reach either of the two: use another name");
         }
     }
 }
@@ -84,18 +87,18 @@ fn executed(
 ) {
     let (word, name) = (kind.word(), target.name.as_str());
     let Some(types) = there.get(name) else {
-        let message = format!("nobody offers the {word} `{}` now", short(name));
+        let message = format!("no node offers the {word} `{}` at the moment", short(name));
         let note = findings.warning(Code::ServiceAway, place, message);
         note.help(match nearest(name, there.keys().copied()) {
             Some(near) => format!("did you mean `{}`?", short(near)),
-            None => "is its node running, and in this graph?".to_owned(),
+            None => "check that its node runs, and in this graph".to_owned(),
         });
         return;
     };
     let wanted = target.type_name.as_str();
     if let Some(other) = types.iter().find(|one| one.as_str() != wanted) {
         let message = format!(
-            "the {word} `{}` is bound as {wanted}, and is {} now",
+            "the {word} `{}` is bound as {wanted}, but its current type is {}",
             short(name),
             short(other)
         );

@@ -67,9 +67,9 @@ fn node(
     } = live
     else {
         let message = format!("the server `{server}` has no variable `{text}`");
-        findings
-            .warning(Code::RemoteNodeAway, place, message)
-            .help("the value is bad until the server has it; all others are as they are");
+        findings.warning(Code::RemoteNodeAway, place, message).help(
+            "this value is bad until the server has the variable; other values are not affected",
+        );
         return;
     };
     let (able, word) = match about.written {
@@ -80,7 +80,7 @@ fn node(
         let message = format!("`{text}` of the server `{server}` cannot be {word}");
         findings
             .warning(Code::RemoteNodeAway, place, message)
-            .help("by this user: its UserAccessLevel says so");
+            .help("by this user, according to its UserAccessLevel");
     }
     if let (Some(live), Some(declared)) = (value, variable.value_type)
         && live != declared
