@@ -105,7 +105,7 @@ pub struct Chunks<'a> {
 #[non_exhaustive]
 pub enum ChunkError {
     /// The budget leaves no byte for the message.
-    #[error("{budget} bytes are no room beside {overhead} bytes of headers and trailer")]
+    #[error("{budget} bytes are not enough for {overhead} bytes of headers and trailer")]
     NoRoom {
         /// Maximum bytes of a NetworkMessage.
         budget: usize,
@@ -117,7 +117,7 @@ pub enum ChunkError {
     Empty,
     /// The message has more bytes than TotalSize or more chunks than NetworkMessageNumber can
     /// represent.
-    #[error("{0} bytes are too many for chunks")]
+    #[error("{0} bytes exceed the limit of chunked messages")]
     TooBig(usize),
     /// A header could not be encoded.
     #[error(transparent)]

@@ -331,7 +331,7 @@ impl<'b> NetworkMessageEncoder<'b> {
         }
         if self.footer_size != footer.len() {
             return Err(EncodeError::Misplaced(
-                "a SecurityFooter of another size than the SecurityHeader says",
+                "the size of the SecurityFooter differs from the SecurityHeader",
             ));
         }
         self.check_finished()?;

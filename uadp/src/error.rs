@@ -82,7 +82,7 @@ impl DecodeError {
 #[non_exhaustive]
 pub enum EncodeError {
     /// The value exceeds the length field of the standard.
-    #[error("{what} of {len} is too big")]
+    #[error("{what} of {len} is too large")]
     TooBig {
         /// Name of the value.
         what: &'static str,

@@ -406,7 +406,7 @@ impl<'a> NetworkMessage<'a> {
                 let header = self.header();
                 Actions::read(&header, self.writer_ids, self.payload, dialect)
             }
-            Some(_) | None => Err(DecodeError::Misread("no Action message")),
+            Some(_) | None => Err(DecodeError::Misread("not an Action message")),
         }
     }
 

@@ -100,7 +100,7 @@ pub enum ChunkRefusal {
     #[error(transparent)]
     Malformed(#[from] DecodeError),
     /// The whole would exceed [`ReassemblyLimits::whole`].
-    #[error("a whole of {total_size} bytes")]
+    #[error("a message of {total_size} bytes exceeds the limit")]
     TooBig {
         /// TotalSize of the whole.
         total_size: u32,
@@ -114,13 +114,13 @@ pub enum ChunkRefusal {
         found: u32,
     },
     /// The chunk was received before.
-    #[error("a chunk once more")]
+    #[error("a repeated chunk")]
     Duplicate,
     /// The chunk overlaps another chunk.
-    #[error("a chunk over others")]
+    #[error("a chunk that overlaps other chunks")]
     Overlap,
     /// The whole has reached [`ReassemblyLimits::pieces`].
-    #[error("too many chunks of one whole")]
+    #[error("too many chunks of a message")]
     TooManyPieces,
 }
 

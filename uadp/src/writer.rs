@@ -21,7 +21,7 @@ impl<const CAPACITY: usize> Room<'_, CAPACITY> {
     pub(crate) fn put<const N: usize>(&mut self, value: [u8; N]) {
         let place = self.bytes.get_mut(self.len..);
         let place = place.and_then(<[u8]>::first_chunk_mut);
-        debug_assert!(place.is_some(), "{CAPACITY} bytes are too few");
+        debug_assert!(place.is_some(), "{CAPACITY} bytes are not enough");
         if let Some(place) = place {
             *place = value;
             self.len += N;

@@ -436,7 +436,7 @@ fn the_innermost_of_ten_levels_is_reached() {
     let mut value = Fields::parse(&block).unwrap().next().unwrap().unwrap();
     for _ in 0..10 {
         let Variant::Array(array) = value else {
-            unreachable!("{value:?} is no array")
+            unreachable!("{value:?} is not an array")
         };
         let Some(Scalar::Variant(inner)) = array.iter().next() else {
             unreachable!("{array:?} holds no Variant")

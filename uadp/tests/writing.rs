@@ -530,7 +530,7 @@ fn a_footer_is_as_long_as_its_header_says() {
         [&header[..], &[0x81, 0x03, 8, 9]].concat()
     );
     let wrong =
-        EncodeError::Misplaced("a SecurityFooter of another size than the SecurityHeader says");
+        EncodeError::Misplaced("the size of the SecurityFooter differs from the SecurityHeader");
     assert_eq!(secured(two, Some(&[8])), Err(wrong));
     assert_eq!(secured(two, None), Err(wrong));
     assert_eq!(secured(SecurityHeader::NONE, Some(&[8])), Err(wrong));

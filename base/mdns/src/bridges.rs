@@ -22,11 +22,11 @@ use crate::host_name;
 use crate::interface::Interface;
 use crate::servers::MdnsFault;
 
-/// Where a bridge tells of itself, on the command line.
+/// The command line option for the announcement of a bridge.
 #[derive(Debug, Clone, PartialEq, Eq, clap::Args)]
 pub struct TellingArguments {
-    /// Where mDNS tells of this bridge: an interface, by name or address; `group`, which is that of the PubSub group, or this
-    /// host alone where none is named; or `none`
+    /// Where mDNS announces this bridge: an interface, by name or address; `group`, the interface
+    /// of the PubSub group, or only this host if none is given; or `none`
     #[arg(
         long = "mdns",
         value_name = "NAME|ADDRESS|CHOICE",
@@ -113,7 +113,7 @@ pub fn tell_bridge(bridge: &Bridge, telling: &Telling, group: Option<&str>) -> O
     match told(bridge, &interface) {
         Ok(told) => Some(told),
         Err(fault) => {
-            warn!("nobody is told of this bridge by mDNS: {fault}");
+            warn!("cannot announce this bridge by mDNS: {fault}");
             None
         }
     }
@@ -124,7 +124,7 @@ fn told(bridge: &Bridge, interface: &Interface) -> Result<ToldBridge, MdnsFault>
     let addresses = interface.addresses();
     let Some(first) = addresses.first() else {
         return Err(fault(mdns_sd::Error::Msg(
-            "it has no address of IPv4".to_owned(),
+            "it has no IPv4 address".to_owned(),
         )));
     };
     let daemon = ServiceDaemon::new_with_port(MDNS_PORT).map_err(fault)?;
@@ -184,10 +184,12 @@ async fn look(monitor: Receiver<DaemonEvent>, interface: Interface) {
     let why = match timeout(ANNOUNCED_WITHIN, announced(&monitor)).await {
         Ok(Ok(name)) => return info!(?name, "announced by mDNS on {interface}"),
         Ok(Err(why)) => why,
-        Err(_) => "nothing goes out, as on a network that is down or knows no multicast".to_owned(),
+        Err(_) => {
+            "nothing can be sent: the network is down or does not support multicast".to_owned()
+        }
     };
     warn!(
-        "nobody is told of this bridge by mDNS on {interface}: {why} (`--mdns none` does without)"
+        "cannot announce this bridge by mDNS on {interface}: {why} (`--mdns none` turns announcements off)"
     );
     // The dropped receiver gets no more events; the daemon bounds the channel.
 }
@@ -221,7 +223,7 @@ impl Drop for ToldBridge {
 /// Fails if no mDNS daemon can be started.
 #[expect(
     clippy::wildcard_enum_match_arm,
-    reason = "the crate tells more, and two say who is there"
+    reason = "the crate reports further events; two of them concern presence"
 )]
 pub async fn heard_bridges(
     interface: &Interface,

@@ -15,10 +15,10 @@ pub struct Range {
 #[non_exhaustive]
 pub enum RangeFault {
     /// The text is not a range.
-    #[error("`{0}` is no range of IPv4 addresses, as 192.168.0.0/24")]
+    #[error("`{0}` is not a range of IPv4 addresses, such as 192.168.0.0/24")]
     Malformed(String),
     /// The range has more addresses than are tried.
-    #[error("/{0} is more than 65536 addresses, which are not tried: /16 is the widest")]
+    #[error("/{0} has more than 65536 addresses: use /16 or a smaller range")]
     Wide(u8),
 }
 

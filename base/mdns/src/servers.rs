@@ -26,7 +26,7 @@ use crate::url::Url;
 
 /// Error of starting the mDNS daemon.
 #[derive(Debug, thiserror::Error)]
-#[error("nobody can be announced or heard on {interface}: {source}")]
+#[error("cannot use mDNS on {interface}: {source}")]
 pub struct MdnsFault {
     interface: String,
     #[source]
@@ -366,7 +366,7 @@ impl Mdns {
 
     #[expect(
         clippy::wildcard_enum_match_arm,
-        reason = "the crate may tell more, and two say who is there"
+        reason = "the crate may report further events; two of them concern presence"
     )]
     fn take(&mut self, event: ServiceEvent) -> Option<Heard> {
         match event {

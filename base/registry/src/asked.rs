@@ -71,7 +71,7 @@ pub enum RegisterFault {
     #[error("the server URI is empty or too long")]
     NoUri,
     /// BadServerUriInvalid: the server URI differs from the certificate of the client.
-    #[error("the server URI is {asked}, the certificate is of {certificate}")]
+    #[error("the server URI is {asked}, but the certificate has {certificate}")]
     OtherUri {
         /// The requested URI.
         asked: String,
@@ -85,7 +85,7 @@ pub enum RegisterFault {
     #[error("the server has no discovery URL")]
     NoUrl,
     /// BadSempahoreFileMissing.
-    #[error("the semaphore file is not there")]
+    #[error("the semaphore file does not exist")]
     NoSemaphore,
     /// BadInvalidArgument: a client cannot register, or a text or list is too long.
     #[error("{what}")]
@@ -94,14 +94,16 @@ pub enum RegisterFault {
         what: &'static str,
     },
     /// BadResourceUnavailable.
-    #[error("{most} servers are registered, and there is no room for more")]
+    #[error("the limit of {most} registered servers is reached")]
     Full {
         /// Maximum number of servers.
         most: usize,
     },
     /// BadSecurityModeInsufficient: a registration without a certificate cannot replace a
     /// registration with a certificate.
-    #[error("{asked} is registered by its certificate, and is changed by it alone")]
+    #[error(
+        "{asked} is registered with a certificate, and only this certificate can change the registration"
+    )]
     Certified {
         /// The requested URI.
         asked: String,
@@ -164,20 +166,16 @@ impl Asked {
 
     fn check_sizes(&self) -> Result<(), RegisterFault> {
         let lists = [
-            (
-                self.names.len(),
-                MAX_NAMES,
-                "more names than a server may have",
-            ),
+            (self.names.len(), MAX_NAMES, "too many names of the server"),
             (
                 self.discovery_urls.len(),
                 MAX_URLS,
-                "more discovery URLs than a server may have",
+                "too many discovery URLs of the server",
             ),
             (
                 self.mdns.as_ref().map_or(0, |mdns| mdns.capabilities.len()),
                 MAX_CAPABILITIES,
-                "more capabilities than a server may have",
+                "too many capabilities of the server",
             ),
         ];
         let too_many = lists.into_iter().find(|(count, most, _)| count > most);
@@ -196,18 +194,19 @@ impl Asked {
         .chain(mdns.flat_map(|mdns| mdns.capabilities.iter().chain([&mdns.name])));
         let mut texts = texts.into_iter();
         if texts.any(|text| text.len() > MAX_TEXT) {
-            let what = "a text that is longer than 1024 bytes";
+            let what = "a text is longer than 1024 bytes";
             return Err(RegisterFault::Invalid { what });
         }
         let strange = |url: &String| url.contains(|c: char| c.is_control() || c.is_whitespace());
         if self.discovery_urls.iter().any(strange) {
-            let what = "a discovery URL with a space or a control character";
+            let what = "a discovery URL contains a space or a control character";
             return Err(RegisterFault::Invalid { what });
         }
         match self.discovery_urls.iter().all(|url| is_endpoint(url)) {
             true => Ok(()),
             false => Err(RegisterFault::Invalid {
-                what: "a discovery URL that is none of a server: `opc.tcp`, `opc.wss` or `https` with a host and a port from 1 on",
+                what: "a discovery URL is not the URL of a server: use `opc.tcp`, `opc.wss` or `https` with \
+                       a host and a port from 1",
             }),
         }
     }

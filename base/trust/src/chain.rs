@@ -36,10 +36,10 @@ impl Known {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
 pub enum Fault {
     /// The certificate cannot be decoded, or its key or signature is invalid.
-    #[error("the certificate is damaged, or its signature is not of the authority that it names")]
+    #[error("the certificate is damaged, or its signature is not from its issuer")]
     Invalid,
     /// An authority of the chain is missing.
-    #[error("an authority above the certificate is not known")]
+    #[error("the certificate of an issuing authority is missing")]
     Incomplete,
     /// The key is too short or too long, or the signature algorithm is insecure.
     #[error(
@@ -56,22 +56,22 @@ pub enum Fault {
     #[error("the certificate of the authority is not valid now")]
     IssuerTime,
     /// The certificate does not name the host of the server.
-    #[error("the certificate is for other hosts than the one that the server is reached at")]
+    #[error("the certificate does not include the host of the server")]
     Host,
     /// The certificate names another ApplicationUri.
-    #[error("the certificate is of another ApplicationUri")]
+    #[error("the certificate has another ApplicationUri")]
     Uri,
     /// The key usage does not permit OPC UA applications.
-    #[error("the certificate is for another use")]
+    #[error("the certificate does not allow this use")]
     Use,
     /// An issuer of its chain may not issue certificates.
-    #[error("what issued the certificate is no authority")]
+    #[error("the issuer of the certificate is not an authority")]
     IssuerUse,
     /// A current revocation list of its authority is missing.
-    #[error("there is no revocation list of the authority that is up to date")]
+    #[error("no valid revocation list of the authority is available")]
     RevocationUnknown,
     /// A current revocation list of a higher authority is missing.
-    #[error("there is no revocation list of the authority above the authority that is up to date")]
+    #[error("no valid revocation list of the superior authority is available")]
     IssuerRevocationUnknown,
     /// The certificate is revoked.
     #[error("the certificate is revoked")]

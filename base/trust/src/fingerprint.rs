@@ -47,7 +47,7 @@ impl fmt::Debug for Fingerprint {
 
 /// The text is not a SHA-256 digest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("a SHA-256 has 64 hexadecimal digits")]
+#[error("a SHA-256 fingerprint has 64 hexadecimal digits")]
 pub struct NoFingerprint;
 
 impl FromStr for Fingerprint {

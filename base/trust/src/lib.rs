@@ -29,23 +29,23 @@ pub use request::Request;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Unfit {
     /// The data is neither DER nor PEM of the expected type.
-    #[error("it cannot be read: neither DER nor PEM of what is wanted")]
+    #[error("it is neither valid DER nor valid PEM of the expected kind")]
     Unreadable,
     /// The key is not an RSA key.
-    #[error("its key is not of RSA")]
+    #[error("its key is not an RSA key")]
     Key,
     /// The signature is invalid, or its algorithm is not supported (RSA with SHA-256, SHA-384 or
     /// SHA-512 is).
-    #[error("its signature is not that of whose it should be")]
+    #[error("its signature is not from the expected issuer")]
     Signature,
     /// A name or a time is invalid in a certificate.
-    #[error("a certificate cannot have that name or time")]
+    #[error("the name or time is not valid in a certificate")]
     Name,
     /// The key length is outside of the range of the security policies.
     #[error("its key has {0} bits; 2048 to 4096 are allowed")]
     Length(usize),
     /// The request lacks the ApplicationUri, which the certificate of an application requires.
-    #[error("it asks for a certificate without an ApplicationUri among its alternative names")]
+    #[error("the request has no ApplicationUri among the alternative names")]
     NoUri,
 }
 

@@ -220,7 +220,7 @@ impl Definition {
         }
         let (written, rest) = clean
             .split_once(char::is_whitespace)
-            .ok_or("a type and a name expected")?;
+            .ok_or("expected a type and a name")?;
         let rest = rest.trim_start();
         // rosidl treats `char` of `.msg` as `uint8`, and the `char` of IDL as a type of its own.
         let byte = written
@@ -246,10 +246,10 @@ impl Definition {
     ) -> Result<(), &'static str> {
         let (kind, arity) = parse_type(dialect, &self.name, written)?;
         let FieldType::Primitive(primitive) = kind else {
-            return Err("a constant is of a primitive type");
+            return Err("a constant needs a primitive type");
         };
         if arity != Arity::One {
-            return Err("a constant is no array");
+            return Err("a constant cannot be an array");
         }
         // genmsg uses the whole line after the first `=`, including a `#`, as the text of a string.
         let value = match (dialect, primitive) {
@@ -282,7 +282,7 @@ impl Definition {
     ) -> Result<(), &'static str> {
         let (name, default) = rest.split_once(char::is_whitespace).unwrap_or((rest, ""));
         if !is_identifier(name) {
-            return Err("a field name expected: letters, digits and `_`, a letter first");
+            return Err("expected a field name: letters, digits and `_`, beginning with a letter");
         }
         if !default.is_empty() && dialect == Dialect::Ros1 {
             return Err("ROS 1 fields have no default value");
@@ -336,14 +336,14 @@ fn parse_type(
     let (base, bound) = match base.split_once("<=") {
         None => (base, None),
         Some((base, bound)) if dialect == Dialect::Ros2 => (base, Some(parse_length(bound)?)),
-        Some(_) => return Err("bounded types are ROS 2's"),
+        Some(_) => return Err("only ROS 2 has bounded types"),
     };
     let kind = match primitive(dialect, base, bound) {
         Some(primitive) => FieldType::Primitive(primitive),
         None => FieldType::Message(message_name(dialect, of, base)?),
     };
     if bound.is_some() && !matches!(kind, FieldType::Primitive(Primitive::Text(_))) {
-        return Err("only strings have a bound of their own");
+        return Err("only strings can have a bound");
     }
     Ok((kind, arity))
 }
@@ -356,7 +356,7 @@ fn parse_arity(dialect: Dialect, length: &str) -> Result<Arity, &'static str> {
         Some(bound) if dialect == Dialect::Ros2 => Ok(Arity::Sequence {
             bound: Some(parse_length(bound)?),
         }),
-        Some(_) => Err("bounded arrays are ROS 2's"),
+        Some(_) => Err("only ROS 2 has bounded arrays"),
         None => Ok(Arity::Fixed(parse_length(length)?)),
     }
 }
@@ -366,7 +366,7 @@ fn parse_length(text: &str) -> Result<u32, &'static str> {
     text.parse()
         .ok()
         .filter(|_| digits)
-        .ok_or("a length of at most 4294967295 expected")
+        .ok_or("expected a length of at most 4294967295")
 }
 
 fn primitive(dialect: Dialect, base: &str, bound: Option<u32>) -> Option<Primitive> {
@@ -399,7 +399,7 @@ fn primitive(dialect: Dialect, base: &str, bound: Option<u32>) -> Option<Primiti
 }
 
 fn message_name(dialect: Dialect, of: &TypeName, base: &str) -> Result<TypeName, &'static str> {
-    let bad = |_| "a type expected: a primitive, `Name` or `package/Name`";
+    let bad = |_| "expected a type: a primitive, `Name` or `package/Name`";
     if base.contains('/') {
         return base.parse().map_err(bad);
     }
@@ -526,52 +526,52 @@ mod tests {
     #[test]
     fn a_line_that_does_not_parse_is_named_with_its_number() {
         for (dialect, line, reason) in [
-            (Dialect::Ros1, "int32", "a type and a name expected"),
+            (Dialect::Ros1, "int32", "expected a type and a name"),
             (
                 Dialect::Ros1,
                 "int32 9lives",
-                "a field name expected: letters, digits and `_`, a letter first",
+                "expected a field name: letters, digits and `_`, beginning with a letter",
             ),
             (
                 Dialect::Ros1,
                 "int32 x 5",
                 "ROS 1 fields have no default value",
             ),
-            (Dialect::Ros1, "string<=4 x", "bounded types are ROS 2's"),
-            (Dialect::Ros1, "int8[<=4] x", "bounded arrays are ROS 2's"),
+            (Dialect::Ros1, "string<=4 x", "only ROS 2 has bounded types"),
+            (
+                Dialect::Ros1,
+                "int8[<=4] x",
+                "only ROS 2 has bounded arrays",
+            ),
             (
                 Dialect::Ros1,
                 "int32[99999999999999999999999] x",
-                "a length of at most 4294967295 expected",
+                "expected a length of at most 4294967295",
             ),
             (
                 Dialect::Ros1,
                 "int32[-1] x",
-                "a length of at most 4294967295 expected",
+                "expected a length of at most 4294967295",
             ),
             (
                 Dialect::Ros1,
                 "int32[+1] x",
-                "a length of at most 4294967295 expected",
+                "expected a length of at most 4294967295",
             ),
             (Dialect::Ros1, "int32] x", "`[` expected"),
             (
                 Dialect::Ros1,
                 "a/b/c x",
-                "a type expected: a primitive, `Name` or `package/Name`",
+                "expected a type: a primitive, `Name` or `package/Name`",
             ),
             (
                 Dialect::Ros1,
                 "Thing X=1",
-                "a constant is of a primitive type",
+                "a constant needs a primitive type",
             ),
-            (Dialect::Ros1, "int8[] X=1", "a constant is no array"),
+            (Dialect::Ros1, "int8[] X=1", "a constant cannot be an array"),
             (Dialect::Ros1, "int8 X=", "a value expected"),
-            (
-                Dialect::Ros2,
-                "int32<=4 x",
-                "only strings have a bound of their own",
-            ),
+            (Dialect::Ros2, "int32<=4 x", "only strings can have a bound"),
         ] {
             let text = format!("bool first\n{line}\n");
             let wanted = DefinitionError::Syntax {

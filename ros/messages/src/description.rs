@@ -83,7 +83,7 @@ impl Registry {
             return Err(DefinitionError::Syntax {
                 name: name.clone(),
                 line: 1,
-                reason: "a description of more types or fields than any message needs",
+                reason: "the description exceeds the limit of types or fields",
                 text: format!("{} types with {fields} fields", types.len()),
             });
         }
@@ -147,7 +147,7 @@ fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, De
     };
     let name: TypeName = described.name.parse().map_err(|_| {
         refused(
-            "a described type whose name is none of a message",
+            "the name of a described type is not a message name",
             &described.name,
         )
     })?;
@@ -155,7 +155,7 @@ fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, De
     for (number, field) in described.fields.iter().enumerate() {
         let Some(written) = written(field) else {
             return Err(refused(
-                "a described field of a type that messages have not",
+                "a described field has a type that messages do not support",
                 &field.name,
             ));
         };

@@ -4,7 +4,7 @@ use crate::{TypeHash, TypeName};
 
 /// Error for a text that is not a message type name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is no message type name: `package/Name` or `package/msg/Name` expected")]
+#[error("`{text}` is not a message type name: expected `package/Name` or `package/msg/Name`")]
 pub struct NameError {
     text: String,
 }
@@ -23,7 +23,7 @@ impl NameError {
 pub enum DefinitionError {
     /// No definition of that name; [`Registry::suggest`](crate::Registry::suggest) returns a
     /// similar name.
-    #[error("no definition of `{name}`{}", needed_by.as_ref().map(|by| format!(", which `{by}` needs")).unwrap_or_default())]
+    #[error("no definition of `{name}`{}", needed_by.as_ref().map(|by| format!(", which `{by}` uses")).unwrap_or_default())]
     Unknown {
         /// The missing type.
         name: TypeName,
@@ -52,7 +52,7 @@ pub enum DefinitionError {
         what: &'static str,
     },
     /// A description of the type does not match the announced hash.
-    #[error("`{name}` is described with the type hash {found}, and {expected} was announced")]
+    #[error("the description of `{name}` has the type hash {found}, but {expected} was announced")]
     OtherHash {
         /// The type.
         name: TypeName,
@@ -111,7 +111,7 @@ pub enum PlanError {
         fault: WriteFault,
     },
     /// A constant for a field that takes the value.
-    #[error("field `{path}` of `{name}` takes the value and cannot be a constant too")]
+    #[error("field `{path}` of `{name}` takes the value, so it cannot be a constant")]
     ConstantOfField {
         /// The message type.
         name: TypeName,
@@ -129,7 +129,7 @@ pub enum PlanError {
         what: &'static str,
     },
     /// ROS 1 bytes of a ROS 2 type, or CDR of a ROS 1 type.
-    #[error("`{name}` is a type of the other ROS: its bytes do not travel on this wire")]
+    #[error("`{name}` is a type of the other ROS version, so its bytes cannot be used here")]
     Wire {
         /// The message type.
         name: TypeName,
@@ -146,10 +146,10 @@ pub enum Fault {
     #[error("the text is not valid Unicode")]
     Text,
     /// A CDR string without its terminating NUL.
-    #[error("the string is not terminated where its length says")]
+    #[error("the string does not end at its announced length")]
     Terminator,
     /// More elements or characters than the bound of the type.
-    #[error("{found} elements, the bound is {bound}")]
+    #[error("{found} elements exceed the bound of {bound}")]
     Bound {
         /// The bound of the type.
         bound: u32,
@@ -158,7 +158,7 @@ pub enum Fault {
     },
     /// More elements without bytes, such as `std_msgs/Empty` on ROS 1, than are accepted in one
     /// message.
-    #[error("{0} more elements without bytes are too many")]
+    #[error("{0} more elements without bytes exceed the limit")]
     WithoutBytes(usize),
     /// Bytes after the last field of a ROS 1 message.
     #[error("{0} bytes left over")]
@@ -172,7 +172,7 @@ pub enum Fault {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ValueFault {
     /// The array is too short for the element.
-    #[error("element {at} is not there: the array has {found}")]
+    #[error("element {at} does not exist: the array has {found} elements")]
     Absent {
         /// The element, from 0.
         at: usize,
@@ -180,7 +180,7 @@ pub enum ValueFault {
         found: usize,
     },
     /// No element has that name.
-    #[error("no element is named `{0}`")]
+    #[error("no element has the name `{0}`")]
     NoName(String),
     /// The target type cannot hold the value.
     #[error("{value} does not fit {}", to.name())]
@@ -191,7 +191,7 @@ pub enum ValueFault {
         to: BuiltinType,
     },
     /// The value is not a number.
-    #[error("a value that is no number cannot become one")]
+    #[error("NaN cannot become an integer")]
     NoNumber,
 }
 
@@ -217,7 +217,7 @@ pub enum ReadError<E> {
         fault: ValueFault,
     },
     /// The sink refused a value.
-    #[error("the field `{field}` cannot be taken")]
+    #[error("cannot use the field `{field}`")]
     Sink {
         /// Path of the field.
         field: String,
@@ -262,7 +262,7 @@ pub enum WriteFault {
     #[error(transparent)]
     Source(#[from] SourceError),
     /// An array with another length than the fixed length of the type.
-    #[error("{found} elements, the type has {expected}")]
+    #[error("{found} elements, but the type has {expected}")]
     Length {
         /// The fixed length.
         expected: u32,
@@ -270,7 +270,7 @@ pub enum WriteFault {
         found: usize,
     },
     /// More elements or characters than the bound of the type or than 32 bits count.
-    #[error("{found} elements, the bound is {bound}")]
+    #[error("{found} elements exceed the bound of {bound}")]
     Bound {
         /// The bound of the type.
         bound: u32,
@@ -278,13 +278,13 @@ pub enum WriteFault {
         found: usize,
     },
     /// More elements without a value (empty messages) than are accepted in one message.
-    #[error("{0} more elements without a value are too many")]
+    #[error("{0} more elements without a value exceed the limit")]
     WithoutValue(usize),
     /// Part of an array: the rest of the array is unknown.
-    #[error("a part of an array is read and cannot be written")]
+    #[error("a part of an array can only be read")]
     Part,
     /// Several fields in another order than in the message, or of which one contains another.
-    #[error("fields in another order than that of the message are read and cannot be written")]
+    #[error("fields in another order than in the message can only be read")]
     Order,
     /// A text with a NUL, which CDR cannot carry.
     #[error("a NUL inside a text")]

@@ -42,7 +42,7 @@ pub(crate) fn definitions<const N: usize>(
             return Err(DefinitionError::Syntax {
                 name: name.clone(),
                 line: text.lines().count(),
-                reason: "the struct of that name, in the modules of its package and kind, expected",
+                reason: "expected the struct of this name in the modules of its package and kind",
                 text: path,
             });
         };
@@ -65,7 +65,7 @@ pub(crate) fn definitions<const N: usize>(
     found.try_into().map_err(|_| DefinitionError::Syntax {
         name: name.clone(),
         line: count,
-        reason: "a struct for each part expected",
+        reason: "expected a struct for each part",
         text: String::new(),
     })
 }
@@ -143,7 +143,7 @@ impl<'t> Parser<'t> {
                 _ => {
                     return Err(fault(
                         token,
-                        "`module`, `struct`, `typedef` or `const` expected: ROS knows no more of IDL",
+                        "expected `module`, `struct`, `typedef` or `const`: ROS supports no other parts of IDL",
                     ));
                 }
             }
@@ -159,7 +159,7 @@ impl<'t> Parser<'t> {
         let name = self.word()?;
         let token = self.next()?;
         if token.text != "{" {
-            return Err(fault(token, "`{` expected: structs of ROS inherit nothing"));
+            return Err(fault(token, "expected `{`: structs in ROS cannot inherit"));
         }
         let mut fields = Vec::new();
         loop {
@@ -218,7 +218,7 @@ impl<'t> Parser<'t> {
         let length = self.number()?;
         self.expect("]")?;
         if kind.arity.is_some() || self.peek().is_some_and(|token| token.text == "[") {
-            return Err(fault(token, "arrays of arrays are not known to ROS"));
+            return Err(fault(token, "ROS does not support arrays of arrays"));
         }
         Ok(Type {
             base: kind.base.clone(),
@@ -295,7 +295,7 @@ impl<'t> Parser<'t> {
             }
             "sequence" => self.sequence(token),
             "unsigned" | "wchar" | "any" | "fixed" | "map" | "union" | "enum" => {
-                Err(fault(token, "a type that ROS has not"))
+                Err(fault(token, "ROS does not support this type"))
             }
             _ => self.named(token),
         }
@@ -307,11 +307,11 @@ impl<'t> Parser<'t> {
         // A sequence in another sequence is refused here, so the recursion ends at the first `<<`
         // of the text.
         if self.peek().is_some_and(|next| next.text == "sequence") {
-            return Err(fault(token, "arrays of arrays are not known to ROS"));
+            return Err(fault(token, "ROS does not support arrays of arrays"));
         }
         let of = self.type_spec()?;
         if of.arity.is_some() {
-            return Err(fault(token, "arrays of arrays are not known to ROS"));
+            return Err(fault(token, "ROS does not support arrays of arrays"));
         }
         let bound = match self.takes(",") {
             true => format!("<={}", self.number()?),
@@ -345,7 +345,7 @@ impl<'t> Parser<'t> {
             _ => {
                 return Err(Fault {
                     line: first.line,
-                    reason: "a type expected: a word of IDL, a typedef from above, or `package::msg::Name`",
+                    reason: "expected a type: an IDL type, an earlier typedef, or `package::msg::Name`",
                     text: written,
                 });
             }
@@ -457,7 +457,7 @@ fn tokens(text: &str) -> Parsed<Vec<Token<'_>>> {
     while let Some(first) = rest.chars().next() {
         let length = length(rest, first).ok_or_else(|| Fault {
             line,
-            reason: "a quote or comment that does not end",
+            reason: "a quote or comment is not closed",
             text: rest.lines().next().unwrap_or_default().to_owned(),
         })?;
         let (taken, behind) = rest.split_at_checked(length.max(1)).unwrap_or((rest, ""));
@@ -474,7 +474,7 @@ fn tokens(text: &str) -> Parsed<Vec<Token<'_>>> {
         {
             return Err(Fault {
                 line,
-                reason: "a name or number of at most 255 bytes expected",
+                reason: "expected a name or number of at most 255 bytes",
                 text: taken.to_owned(),
             });
         }
@@ -620,30 +620,30 @@ module robot_msgs {
         let name: TypeName = "p/T".parse().unwrap();
         for (member, reason) in [
             ("long double x;", "`;` expected"),
-            ("wchar x;", "a type that ROS has not"),
-            ("double x[2][3];", "arrays of arrays are not known to ROS"),
+            ("wchar x;", "ROS does not support this type"),
+            ("double x[2][3];", "ROS does not support arrays of arrays"),
             (
                 "sequence<sequence<long>> x;",
-                "arrays of arrays are not known to ROS",
+                "ROS does not support arrays of arrays",
             ),
             ("double x", "`;` expected"),
             (
                 "Other::X x;",
-                "a type expected: a word of IDL, a typedef from above, or `package::msg::Name`",
+                "expected a type: an IDL type, an earlier typedef, or `package::msg::Name`",
             ),
             (
                 "double x[99999999999999];",
-                "a length of at most 4294967295 expected",
+                "expected a length of at most 4294967295",
             ),
             ("double x; double x;", "the field is defined twice"),
-            ("\"x", "a quote or comment that does not end"),
+            ("\"x", "a quote or comment is not closed"),
             (
                 format!("double {};", "x".repeat(256)).as_str(),
-                "a name or number of at most 255 bytes expected",
+                "expected a name or number of at most 255 bytes",
             ),
             (
                 format!("double x[{}];", "1".repeat(256)).as_str(),
-                "a name or number of at most 255 bytes expected",
+                "expected a name or number of at most 255 bytes",
             ),
         ] {
             let text = format!("module p {{ module msg {{\nstruct T {{\n{member} }};\n}}; }};");

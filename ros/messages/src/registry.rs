@@ -247,7 +247,7 @@ impl Registry {
             return Err(DefinitionError::Syntax {
                 name: name.clone(),
                 line: 1,
-                reason: "ROS 1 has no definitions in IDL",
+                reason: "ROS 1 does not use IDL definitions",
                 text: String::new(),
             });
         }
@@ -353,7 +353,7 @@ fn sections<'t>(
                     return Err(DefinitionError::Syntax {
                         name: name.clone(),
                         line: number + 1,
-                        reason: "`MSG: package/Name` expected after a line of `=`",
+                        reason: "expected `MSG: package/Name` after a line of `=`",
                         text: content.chars().take(200).collect(),
                     });
                 };

@@ -176,7 +176,7 @@ impl ServiceDefinition {
         let [request, response] = parts(
             name,
             text,
-            "one line `---` expected, between request and response",
+            "expected one line `---` between request and response",
         )?;
         Ok(Self {
             request: request.parse(dialect, &derived(name, "Request")?)?,
@@ -248,7 +248,7 @@ pub(crate) fn action_parts(
 }
 
 const RESULT_RESPONSE: &str = "_GetResult_Response";
-const ACTION_PARTS: &str = "two lines `---` expected, between goal, result and feedback";
+const ACTION_PARTS: &str = "expected two lines `---` between goal, result and feedback";
 
 /// Returns the messages that genaction creates from an `.action` text, or the messages of rosidl
 /// that differ between actions.

@@ -52,7 +52,7 @@ impl FromStr for TypeHash {
 
 /// Error for a text that is not a type hash of the supported version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("`RIHS01_` and 64 hex digits expected")]
+#[error("expected `RIHS01_` and 64 hexadecimal digits")]
 pub struct NoTypeHash;
 
 /// Returns the description of a message and of the types it needs.

@@ -101,7 +101,7 @@ fn a_missing_type_is_named_with_who_needs_it_and_what_may_be_meant() {
     let error = registry.get(&name("t/T")).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "no definition of `geometry_msgs/Pont`, which `t/T` needs"
+        "no definition of `geometry_msgs/Pont`, which `t/T` uses"
     );
     assert_eq!(
         registry.suggest(&name("geometry_msgs/Pont")),
@@ -424,7 +424,7 @@ fn a_service_is_two_messages_found_only_through_it() {
     let error = registry.service(&name("t/List")).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "no definition of `t/Item`, which `t/ListResponse` needs"
+        "no definition of `t/Item`, which `t/ListResponse` uses"
     );
     registry.add(&name("t/Item"), "string id").unwrap();
     let found = registry.service(&name("t/List")).unwrap();

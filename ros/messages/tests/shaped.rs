@@ -153,15 +153,15 @@ fn what_a_message_has_not_is_told_with_its_field() {
         };
         assert_eq!(
             fault("position[3]"),
-            "field `position`: element 3 is not there: the array has 3"
+            "field `position`: element 3 does not exist: the array has 3 elements"
         );
         assert_eq!(
             fault("name[7]"),
-            "field `name`: element 7 is not there: the array has 3"
+            "field `name`: element 7 does not exist: the array has 3 elements"
         );
         assert_eq!(
             fault("position[name=elbow]"),
-            "field `position`: no element is named `elbow`"
+            "field `position`: no element has the name `elbow`"
         );
         let cut = &bytes[..bytes.len() / 2];
         let plan = Plan::compile(&of, &select("late[0]", Conversion::default()), wire).unwrap();
@@ -500,7 +500,7 @@ fn a_part_behind_the_end_of_an_array_of_bytes_of_one_length_is_refused() {
     for field in ["uuid[16]", "uuid[16:]", "goal.uuid[16]", "goal.uuid[20:30]"] {
         let error = compiled(field).unwrap_err().to_string();
         assert!(
-            error.ends_with("has fewer elements, always"),
+            error.ends_with("always has fewer elements"),
             "{field}: {error}"
         );
     }

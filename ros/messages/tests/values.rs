@@ -551,7 +551,7 @@ fn a_constant_that_does_not_fit_its_field_is_told_with_what_would() {
         (
             "key",
             list(&["1"]),
-            "field `key` of `t/T`: 1 elements, the type has 3",
+            "field `key` of `t/T`: 1 elements, but the type has 3",
         ),
         (
             "levels",
@@ -563,7 +563,7 @@ fn a_constant_that_does_not_fit_its_field_is_told_with_what_would() {
         (
             "many",
             list(&["1"]),
-            "arrays of messages have no constant but []",
+            "[] is the only constant of an array of messages",
         ),
         (
             "colour",
@@ -573,7 +573,7 @@ fn a_constant_that_does_not_fit_its_field_is_told_with_what_would() {
         (
             "note",
             one("x"),
-            "field `note` of `t/T` takes the value and cannot be a constant too",
+            "field `note` of `t/T` takes the value, so it cannot be a constant",
         ),
     ] {
         let selection = template(Some("note"), &[(path, literal)]);

@@ -219,7 +219,7 @@ impl Registry {
                 let name = full_name(name, caller)?;
                 let told = value.and_then(|value| tree.set(&name, value, caller));
                 let Some(told) = told else {
-                    return Ok(triple(-1, "the root of all parameters is no value", 0));
+                    return Ok(triple(-1, "the root of all parameters is not a value", 0));
                 };
                 self.tell(told);
                 done(0)
@@ -459,7 +459,7 @@ fn not_too_deep(name: &str) -> Result<(), Fault> {
     if parts(name).nth(MAX_PARTS).is_some() {
         let name = clipped(name);
         return Err(fault(format!(
-            "`{name}` has more than {MAX_PARTS} parts, which this master does not take"
+            "`{name}` has more than {MAX_PARTS} parts, the limit of this master"
         )));
     }
     Ok(())

@@ -47,7 +47,7 @@ pub(crate) fn time_source_changed(simulated: bool) {
     if simulated {
         info!("/use_sim_time is true: using the time of /clock");
     } else {
-        info!("/use_sim_time is no longer true: the time is the wall clock's");
+        info!("/use_sim_time is not true: using the system clock");
     }
 }
 
@@ -62,12 +62,13 @@ pub(crate) fn hostname_unresolvable(hostname: &str, error: &dyn Display) {
     warn!(
         hostname,
         %error,
-        "other nodes are told this host name, and it does not resolve even here: set ROS_IP or ROS_HOSTNAME"
+        "this node announces a host name that does not resolve on this host: other nodes may not reach it; \
+         set ROS_IP or ROS_HOSTNAME"
     );
 }
 
 pub(crate) fn shutdown_asked(reason: &str) {
-    warn!(reason, "told to shut down, as `rosnode kill` does");
+    warn!(reason, "shutting down on request, as by `rosnode kill`");
 }
 
 /// `more`: the number of suppressed entries since the last entry.
@@ -75,7 +76,7 @@ pub(crate) fn name_kept(name: &str, more: u64) {
     warn!(
         name,
         more,
-        "another node with the same name has registered as well, and the name is this node's: going on"
+        "another node has registered with the name of this node: this node continues; give the other node another name"
     );
 }
 
@@ -85,7 +86,7 @@ pub(crate) fn registrations_lost(uri: &str, first: &str, missing: usize) {
         ROS_MASTER_URI = uri,
         first,
         missing,
-        "the ROS master no longer lists what this node has registered, as after `rosnode cleanup`: registering it again"
+        "the ROS master has lost registrations of this node, as after `rosnode cleanup`: registering them again"
     );
 }
 
@@ -111,7 +112,7 @@ pub(crate) fn message_too_long(topic: &str, bytes: usize) {
 
 /// `more`: the number of suppressed entries since the last entry.
 pub(crate) fn service_failed(service: &str, client: &str, why: &str, more: u64) {
-    warn!(service, client, why, more, "a request was given up");
+    warn!(service, client, why, more, "a service request failed");
 }
 
 pub(crate) fn publisher_joined(topic: &str, publisher: &str) {
@@ -132,14 +133,15 @@ pub(crate) fn link_failed(
         uri,
         %error,
         more,
-        "no connection to a registered publisher, still trying: if that node is gone, `rosnode cleanup` removes it; if it runs, check that its host name resolves here"
+        "cannot connect to a registered publisher, trying again: if the node has died, remove it with \
+         `rosnode cleanup`; if it runs, check that its host name resolves on this host"
     );
 }
 
 pub(crate) fn links_not_told(period: Duration) {
     warn!(
         ?period,
-        "more registered publishers cannot be connected to: they are counted in the next line about one, not named"
+        "cannot connect to further registered publishers: the next such line has their number in `more`"
     );
 }
 
@@ -155,10 +157,7 @@ pub(crate) fn link_waits(topic: &str, more: u64) {
 pub(crate) fn too_many_publishers(topic: &str, named: usize, limit: usize, more: u64) {
     warn!(
         topic,
-        named,
-        limit,
-        more,
-        "a topic has more publishers than are connected to: the rest is left alone"
+        named, limit, more, "ignored publishers of a topic above the limit"
     );
 }
 

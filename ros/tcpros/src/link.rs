@@ -310,9 +310,9 @@ pub(crate) fn transport_info(stream: &TcpStream) -> String {
 /// Reason for which a publisher is not connected.
 #[derive(Debug, Error)]
 enum LinkError {
-    #[error("it does not tell its address: {0}")]
+    #[error("it does not announce its address: {0}")]
     Request(#[from] MasterError),
-    #[error("its address does not answer within {0:?}")]
+    #[error("no response from its address within {0:?}")]
     NoConnection(Duration),
     #[error("it sent no connection header within {0:?}")]
     NoHeader(Duration),
@@ -320,7 +320,7 @@ enum LinkError {
     Header(#[from] HeaderError),
     #[error("it refuses: {0}")]
     Refused(String),
-    #[error("it publishes {theirs}, and {ours} is wanted")]
+    #[error("it publishes {theirs}, but {ours} is required")]
     OtherType { theirs: String, ours: String },
     #[error("it is this node")]
     Ourselves,

@@ -325,7 +325,7 @@ pub enum MasterError {
         message: String,
     },
     /// The reply of the peer violates the ROS API.
-    #[error("the answer to {0} is not of the form ROS prescribes")]
+    #[error("the response to {0} does not have the form that ROS requires")]
     Shape(&'static str),
 }
 

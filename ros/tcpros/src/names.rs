@@ -108,11 +108,11 @@ fn canonical(full: &str) -> Option<String> {
 pub enum NameError {
     /// Not a letter, `/` or `~` followed by letters, digits, `_` and `/`.
     #[error(
-        "`{0}` is no ROS name: letters, digits, `_` and `/`, beginning with a letter, `/` or `~`"
+        "`{0}` is not a ROS name: use letters, digits, `_` and `/`, beginning with a letter, `/` or `~`"
     )]
     Invalid(String),
     /// The name of a node contains no `/`; the part before it belongs to the namespace.
-    #[error("`{0}` is no node name: put what stands before the last `/` into the namespace")]
+    #[error("`{0}` is not a node name: move the part before the last `/` into the namespace")]
     NodeName(String),
 }
 

@@ -194,7 +194,7 @@ pub enum ParamError {
     #[error(transparent)]
     Master(#[from] MasterError),
     /// The node of the subscription has ended.
-    #[error("the node has ended, and its parameters are no longer followed")]
+    #[error("the node has ended, so its parameters are not updated")]
     NodeEnded,
 }
 

@@ -250,7 +250,7 @@ impl Registrar {
             }
             Err(error) if since.elapsed() < LONGEST_CONTEST => return Err(error),
             Err(error) => self.node.ask_to_shut_down(&format!(
-                "another node has taken the name {name}, and the master does not say which: {error}"
+                "another node has taken the name {name}, and the master does not report its address: {error}"
             )),
         }
         Ok(())

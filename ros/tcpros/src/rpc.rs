@@ -257,19 +257,19 @@ pub enum RpcError {
     #[error("no connection: {0}")]
     Connect(#[source] std::io::Error),
     /// No response in time.
-    #[error("no answer within {0:?}")]
+    #[error("no response within {0:?}")]
     Timeout(Duration),
     /// The peer does not use HTTP, or stopped midway.
     #[error("HTTP failed: {0}")]
     Http(#[from] hyper::Error),
     /// The body of the response was not received or is longer than 4 MiB.
-    #[error("the answer was not read: {0}")]
+    #[error("cannot read the response: {0}")]
     Body(String),
     /// A status other than 200.
     #[error("HTTP status {0}")]
     Status(u16),
     /// The response is not XML-RPC.
-    #[error("the answer is not XML-RPC: {0}")]
+    #[error("the response is not XML-RPC: {0}")]
     Xml(#[from] XmlError),
     /// The method failed at the peer.
     #[error(transparent)]

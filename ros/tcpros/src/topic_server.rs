@@ -259,9 +259,9 @@ enum Refused {
 pub(crate) enum Ended {
     #[error("it closed the connection")]
     Closed,
-    #[error("what it asked for was withdrawn")]
+    #[error("the topic or service was withdrawn")]
     Withdrawn,
-    #[error("it took nothing for {STALL_LIMIT:?}")]
+    #[error("it received nothing for {STALL_LIMIT:?}")]
     Stalled,
     #[error("the connection failed: {0}")]
     Failed(std::io::Error),

@@ -267,7 +267,7 @@ async fn a_goal_that_the_server_drops_is_aborted_and_so_are_all_when_it_stops() 
     drop(goal(&mut server).await);
     let (status, text, body) = ended(&mut handle).await;
     assert_eq!((status, &*body), (Status::Aborted, b"empty".as_slice()));
-    assert!(text.contains("gave the goal up"), "{text}");
+    assert!(text.contains("abandoned the goal"), "{text}");
     let mut handle = client.send_goal(b"2");
     let held = goal(&mut server).await;
     drop(server);
@@ -285,7 +285,9 @@ async fn a_goal_for_no_server_is_lost_at_once_and_the_reason_names_the_topic() {
         .await
         .unwrap_err();
     assert!(
-        missing.to_string().contains("/count: no status"),
+        missing
+            .to_string()
+            .contains("/count: no server has published its status"),
         "{missing}"
     );
     let mut handle = client.send_goal(b"");

@@ -249,7 +249,7 @@ async fn a_request_that_fails_panics_or_hangs_costs_only_itself_and_says_why() {
         for (request, words) in [
             ("fail", "the gripper is stuck"),
             ("panic", "panicked"),
-            ("hang", "no answer within 100ms"),
+            ("hang", "did not respond within 100ms"),
         ] {
             let error = ask(&client, request).await.unwrap_err();
             assert!(!error.may_have_run());

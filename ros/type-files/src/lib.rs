@@ -138,8 +138,8 @@ pub fn read_bounded(file: &Path, most: u64) -> Result<Vec<u8>, String> {
         return Ok(bytes);
     }
     Err(match most >> 20 {
-        0 => format!("it has more than {} KiB", most >> 10),
-        mebibytes => format!("it has more than {mebibytes} MiB"),
+        0 => format!("it is larger than {} KiB", most >> 10),
+        mebibytes => format!("it is larger than {mebibytes} MiB"),
     })
 }
 
@@ -262,7 +262,7 @@ pub(crate) fn open(path: &Path) -> std::io::Result<File> {
         File::open(path)
     } else {
         Err(std::io::Error::other(
-            "it is no regular file, or link to one; nothing else is read",
+            "it is not a regular file or a link to a regular file",
         ))
     }
 }

@@ -115,9 +115,8 @@ impl TypePaths {
         let Some(file) = self.file(dialect, kind, name) else {
             return;
         };
-        self.kept.push(format!(
-            "{file}: what `{name}` needs is not defined any more"
-        ));
+        self.kept
+            .push(format!("{file}: a type that `{name}` uses is not defined"));
         let mut asked = Asked {
             of: before,
             found: Vec::new(),
@@ -221,7 +220,9 @@ impl TypePaths {
         self.unlisted.extend(below);
         let found = match (found, own.into_iter().next()) {
             (Ok(_), Some((_, why))) => Err(why),
-            (Ok(found), None) if found.is_empty() => Err("no definition files in it".to_owned()),
+            (Ok(found), None) if found.is_empty() => {
+                Err("it contains no definition files".to_owned())
+            }
             (Ok(found), None) => Ok(found),
             (Err(error), _) => Err(error.to_string()),
         };
@@ -247,13 +248,15 @@ impl TypePaths {
     fn add(&mut self, file: &DefinitionFile) -> Result<(), String> {
         let path = file.path.display();
         let name = file.name().ok_or_else(|| {
-            format!("{path}: package and file are no name of a type: letters, digits and `_`, a letter first")
+            format!("{path}: the names of package and file are not valid in ROS: use letters, digits and \
+                     `_`, beginning with a letter")
         })?;
         let text = read(&file.path).map_err(|error| format!("{path}: {error}"))?;
         let bytes = self.bytes.saturating_add(text.len());
         if bytes > MOST_TOGETHER {
             return Err(format!(
-                "{path}: with it the definitions are more than {MOST_TOGETHER} bytes; name the packages that are needed"
+                "{path}: with this file the definitions exceed {MOST_TOGETHER} bytes; list only the \
+                 packages that are needed"
             ));
         }
         let text = Arc::new(definition(text, &file.path));

@@ -144,7 +144,7 @@ fn an_installation_of_ros_2_is_read_below_share_and_prefers_the_msg_to_the_idl_m
 fn what_is_no_regular_file_is_not_opened() {
     for file in ["/dev/null", "/"] {
         let refused = Disk.read(file).unwrap_err();
-        assert!(refused.contains("no regular file"), "{refused}");
+        assert!(refused.contains("not a regular file"), "{refused}");
     }
 }
 
@@ -221,9 +221,10 @@ fn a_file_that_does_not_parse_is_told_with_its_line_and_the_others_count() {
         })
         .collect();
     let expected = [
-        (0, "/types/robot_msgs/msg/Bad.msg:2: a field name expected: letters, digits and `_`, a letter first: `int32 9lives`"),
-        (0, "/types/robot_msgs/msg/Only2.msg:1: bounded types are ROS 2's: `string<=4 x`"),
-        (1, "/empty: no definition files in it"),
+        (0, "/types/robot_msgs/msg/Bad.msg:2: expected a field name: letters, digits and `_`, beginning \
+             with a letter: `int32 9lives`"),
+        (0, "/types/robot_msgs/msg/Only2.msg:1: only ROS 2 has bounded types: `string<=4 x`"),
+        (1, "/empty: it contains no definition files"),
         (2, "/nowhere: No such file or directory (os error 2)"),
     ]
     .map(|(path, why)| (path, why.to_owned()));
@@ -503,7 +504,7 @@ fn a_type_is_kept_with_what_it_needs() {
     let mut without = read();
     let service = name("robot_msgs/Move");
     without.keep_whole(&before, Dialect::Ros1, TextKind::Service, &service);
-    assert!(matches!(without.kept(), [one] if one.contains("`robot_msgs/Move` needs")));
+    assert!(matches!(without.kept(), [one] if one.contains("a type that `robot_msgs/Move` uses")));
     for (message, is_there) in [("Leg", true), ("Other", false)] {
         let message = name(&format!("robot_msgs/{message}"));
         let file = without.file(Dialect::Ros1, TextKind::Message, &message);
@@ -519,15 +520,15 @@ fn files_are_read_within_their_bound() {
     assert_eq!(read_bounded(&file, 3).unwrap(), b"abc");
     assert_eq!(
         read_bounded(&file, 2).unwrap_err(),
-        "it has more than 0 KiB"
+        "it is larger than 0 KiB"
     );
     let endless = Path::new("/dev/zero");
     assert_eq!(
         read_bounded(endless, 64 << 10).unwrap_err(),
-        "it has more than 64 KiB"
+        "it is larger than 64 KiB"
     );
     assert_eq!(
         read_text_file(endless).unwrap_err(),
-        "it has more than 8 MiB"
+        "it is larger than 8 MiB"
     );
 }

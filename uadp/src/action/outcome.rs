@@ -31,7 +31,7 @@ pub enum Refusal {
     #[error("not allowed")]
     NotAllowed,
     /// Not executable in the present state: Bad_NotExecutable.
-    #[error("not executable now")]
+    #[error("not executable at the moment")]
     NotExecutable,
     /// The limit of concurrent executions is reached: Bad_TooManyOperations.
     #[error("busy")]
@@ -40,7 +40,7 @@ pub enum Refusal {
     #[error("invalid arguments")]
     InvalidArgument,
     /// The arguments are too big: Bad_RequestTooLarge.
-    #[error("arguments too big")]
+    #[error("arguments too large")]
     TooBig,
     /// The Responder is shutting down: Bad_Shutdown.
     #[error("shutting down")]
@@ -52,13 +52,13 @@ pub enum Refusal {
 #[non_exhaustive]
 pub enum Unknown {
     /// The deadline passed without a response. A Responder reports its own timeout as Bad_Timeout.
-    #[error("no answer before the deadline")]
+    #[error("no response before the deadline")]
     Deadline,
     /// The receive timeout passed without a message of the Responder.
-    #[error("the responder is silent")]
+    #[error("the responder is lost")]
     Silent,
     /// The Responder lost the connection to the executor: Bad_NoCommunication.
-    #[error("what executed it was lost")]
+    #[error("the executor was lost")]
     Lost,
 }
 

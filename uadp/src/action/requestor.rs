@@ -139,10 +139,10 @@ pub enum Heard<'a> {
 #[non_exhaustive]
 pub enum CallRefusal {
     /// The limit [`RequestorSettings::max_calls`] is reached.
-    #[error("{0} calls at a time are all there may be")]
+    #[error("the limit of {0} simultaneous calls is reached")]
     TooManyCalls(usize),
     /// The arguments would exceed [`RequestorSettings::max_bytes`].
-    #[error("{bytes} bytes of arguments are too many")]
+    #[error("{bytes} bytes of arguments exceed the limit")]
     TooManyBytes {
         /// Total argument bytes, including the new call.
         bytes: usize,
@@ -155,7 +155,7 @@ pub enum CallRefusal {
     Malformed(DecodeError),
     /// The dialect does not support the encoding of the arguments, or requires a FieldCount for
     /// RawData.
-    #[error("arguments in an encoding the peer does not know")]
+    #[error("the peer does not support the encoding of the arguments")]
     Encoding,
 }
 
@@ -167,19 +167,19 @@ pub enum ResponseDrop {
     #[error("a request")]
     Request,
     /// The response belongs to another Requestor, or to an earlier instance of this Requestor.
-    #[error("an answer to another requestor")]
+    #[error("a response to another requestor")]
     Foreign,
     /// No open call has this id.
-    #[error("an answer to no call")]
+    #[error("a response to an unknown call")]
     NoCall,
     /// The response has another address or dialect than the call.
-    #[error("an answer from elsewhere")]
+    #[error("a response from another address")]
     Elsewhere,
     /// The call has its response already.
-    #[error("an answer once more")]
+    #[error("a repeated response")]
     Repeated,
     /// The call was given up.
-    #[error("an answer too late")]
+    #[error("a late response")]
     Late,
     /// The state is not valid in the present phase.
     #[error("an unexpected state")]

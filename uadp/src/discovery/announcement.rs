@@ -155,7 +155,7 @@ impl<'a> Announcement<'a> {
         match message.message_type() {
             NetworkMessageType::Announcement => Self::decode_body(read_payload(message)?),
             NetworkMessageType::DataSet | NetworkMessageType::Probe => {
-                Err(DecodeError::Misread("no discovery announcement"))
+                Err(DecodeError::Misread("not a discovery announcement"))
             }
         }
     }
@@ -352,7 +352,7 @@ impl<'a> Announced<'a> {
             } => {
                 if statuses.len() != writer_ids.len() {
                     return Err(EncodeError::Misplaced(
-                        "another number of statuses than of DataSetWriterIds",
+                        "the numbers of statuses and of DataSetWriterIds differ",
                     ));
                 }
                 writer_ids.write(out, WRITER_IDS)?;
@@ -384,7 +384,7 @@ impl<'a> Announced<'a> {
                 }
             }
             Self::ActionMetaData(action) if !action.has_its_methods() => Err(
-                EncodeError::Misplaced("another number of ActionMethods than of ActionTargets"),
+                EncodeError::Misplaced("the numbers of ActionMethods and of ActionTargets differ"),
             ),
             Self::ActionMetaData(action) => action.write(out, "ActionMetaData"),
         }

@@ -53,7 +53,7 @@ impl<'a> Probe<'a> {
         match message.message_type() {
             NetworkMessageType::Probe => Self::decode_body(read_payload(message)?),
             NetworkMessageType::DataSet | NetworkMessageType::Announcement => {
-                Err(DecodeError::Misread("no discovery probe"))
+                Err(DecodeError::Misread("not a discovery probe"))
             }
         }
     }

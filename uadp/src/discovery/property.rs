@@ -100,5 +100,5 @@ fn elements(element: BuiltinType, count: usize, bytes: &[u8]) -> Result<Variant<
     let array: Result<_, DecodeError> = Array::new(element, count, bytes);
     array
         .map(Variant::Array)
-        .map_err(|_| EncodeError::Misplaced("an array that cannot be read back"))
+        .map_err(|_| EncodeError::Misplaced("an array that cannot be decoded again"))
 }

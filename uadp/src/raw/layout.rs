@@ -163,7 +163,7 @@ pub enum RawLayoutFault {
     },
     /// The field is optional in a type without optional fields, or there are more than 32 optional
     /// fields.
-    #[error("an optional field too many")]
+    #[error("too many optional fields")]
     Optional,
     /// Structures are nested deeper than [`RawStructure::MAX_DEPTH`].
     #[error("structures nested too deep")]

@@ -72,7 +72,7 @@ pub enum RawWriteFault {
     #[error("a structure without a binary body")]
     NoBody,
     /// The body is not a valid body of the structure.
-    #[error("a structure that is none: {0}")]
+    #[error("not a structure: {0}")]
     Body(DecodeError),
 }
 

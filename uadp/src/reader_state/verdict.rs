@@ -30,7 +30,7 @@ pub enum ReaderDrop {
     #[error("marked as not valid")]
     Invalid,
     /// The table of readers is full of active writers.
-    #[error("no place for another writer")]
+    #[error("the limit of writers is reached")]
     TableFull,
     /// The PublisherId is too long for the table.
     #[error("a PublisherId of {len} bytes")]
@@ -64,7 +64,7 @@ pub enum ReaderDrop {
         behind: u16,
     },
     /// The sequence number is neither newer nor older (OPC 10000-14, 7.2.3).
-    #[error("a sequence number out of the window")]
+    #[error("a sequence number outside the window")]
     OutOfWindow,
     /// The message needs other metadata (OPC 10000-14, 6.2.9.4).
     #[error("major version {found} where the metadata has {expected}")]

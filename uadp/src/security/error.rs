@@ -17,7 +17,7 @@ pub enum KeyError {
         found: usize,
     },
     /// The SecurityTokenId is 0, which means "no SecurityTokenId".
-    #[error("0 is no SecurityTokenId")]
+    #[error("0 is not a valid SecurityTokenId")]
     TokenId,
     /// The number of keys, which is 0 or exceeds the limit.
     #[error("{0} keys given at once")]
@@ -50,7 +50,7 @@ pub enum SecurityError {
         found: usize,
     },
     /// The encrypted part has this many bytes, 4 GiB or more.
-    #[error("{0} bytes of payload are too many")]
+    #[error("{0} bytes of payload exceed the limit")]
     TooLong(usize),
     /// There is no key for this SecurityTokenId, so the known keys may be outdated. The sender of
     /// the message is not verified: limit the rate of requests to the Security Key Service that
@@ -58,13 +58,13 @@ pub enum SecurityError {
     #[error("no key for the SecurityTokenId {0}")]
     UnknownToken(u32),
     /// The key of this SecurityTokenId was removed because newer keys are in use.
-    #[error("the SecurityTokenId {0} is out of use")]
+    #[error("the SecurityTokenId {0} has expired")]
     RetiredToken(u32),
     /// The message was not signed with the key, or was changed.
-    #[error("the signature is wrong")]
+    #[error("wrong signature")]
     Signature,
     /// A message with this sequence number was accepted before.
-    #[error("sequence number {0} for the second time")]
+    #[error("repeated sequence number {0}")]
     Replayed(u32),
     /// The sequence number is so far behind the newest that a repetition cannot be detected.
     #[error("sequence number {sequence} is too far behind {newest}")]
@@ -93,7 +93,7 @@ pub enum SecurityError {
 #[non_exhaustive]
 pub enum SealError {
     /// There are no keys.
-    #[error("no keys to secure messages with")]
+    #[error("no keys for securing messages")]
     NoKeys,
     /// All sequence numbers of the key with this SecurityTokenId are used.
     #[error("no sequence number is left for the SecurityTokenId {0}")]

@@ -30,7 +30,8 @@ impl Seal<'_> {
     /// Writes the headers with the SecurityHeader, and the payload. Returns the offset of the
     /// payload.
     fn headers(&self, datagram: &[u8], buf: &mut Vec<u8>) -> Result<usize, EncodeError> {
-        const NO_MESSAGE: EncodeError = EncodeError::Misplaced("a seal on no NetworkMessage");
+        const NO_MESSAGE: EncodeError =
+            EncodeError::Misplaced("only a NetworkMessage can be secured");
         let message = NetworkMessage::decode(datagram).map_err(|_| NO_MESSAGE)?;
         if message.is_sealed() || !message.footer().is_empty() {
             return Err(EncodeError::Misplaced("a second seal"));

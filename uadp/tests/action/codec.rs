@@ -142,7 +142,7 @@ fn an_action_is_not_taken_for_data_nor_data_for_an_action() {
         ))
     );
     let data = [0xD1, 0x00, 2, 1, 61, 0, 1, 0, 0];
-    let no_action = Some(DecodeError::Misread("no Action message"));
+    let no_action = Some(DecodeError::Misread("not an Action message"));
     assert_eq!(fault(&data, STANDARD), no_action);
 }
 

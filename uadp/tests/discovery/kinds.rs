@@ -199,7 +199,7 @@ fn other_messages_are_not_taken_for_discovery() {
     let message = NetworkMessage::decode(&probe).unwrap();
     assert_eq!(
         Announcement::decode(&message),
-        Err(DecodeError::Misread("no discovery announcement"))
+        Err(DecodeError::Misread("not a discovery announcement"))
     );
 
     let signed = SecurityHeader {

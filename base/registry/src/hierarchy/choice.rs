@@ -28,8 +28,8 @@ pub struct Pattern {
 /// Error for an invalid choice.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "`{0}` names no discovery server: an opc.tcp:// URL, any, uri=<ApplicationUri>, name=<mDNS name> (both may end with *) \
-     or node=<NodeId> are possible"
+    "`{0}` does not select a discovery server: give an opc.tcp:// URL, any, uri=<ApplicationUri>, \
+     name=<mDNS name> (both may end with *) or node=<NodeId>"
 )]
 pub struct ChoiceFault(String);
 

@@ -11,7 +11,8 @@ pub struct Place(String);
 /// Error for an invalid location.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "`{0}` is no place: names with slashes between them, as cell-1/station-a, at most {MOST_NAMES} of 64 letters"
+    "`{0}` is not a location: give names separated by slashes, such as cell-1/station-a, at most \
+     {MOST_NAMES} names of 64 characters"
 )]
 pub struct PlaceFault(String);
 

@@ -77,10 +77,10 @@ impl Conversion {
             return Ok(field);
         }
         if self.invert && (field, to) != (BuiltinType::Boolean, BuiltinType::Boolean) {
-            return Err("is no Boolean, and only those are inverted");
+            return Err("is not a Boolean, and `invert` needs a Boolean");
         }
         if self.linear.is_some() && !is_number(field) {
-            return Err("is no number, and only those are scaled");
+            return Err("is not a number, and `scale` and `offset` need a number");
         }
         if to != field && !(is_number(field) && is_number(to)) {
             return Err("cannot become that type: only numbers become other numbers");

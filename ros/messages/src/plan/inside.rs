@@ -43,7 +43,7 @@ impl Inside {
         };
         let Some((name, leaves)) = message.element_leaves(array) else {
             return Err(fault(
-                "is no array of messages, so nothing is in its elements",
+                "is not an array of messages, so its elements have no fields",
             ));
         };
         let place = |path: &str| {
@@ -62,7 +62,7 @@ impl Inside {
             Part::Named { by, name } => {
                 let (by, text) = place(by)?;
                 if (text.builtin, text.rank) != (BuiltinType::String, Rank::Scalar) {
-                    return Err(fault("is to be found by a field that is no text"));
+                    return Err(fault("is selected by a field that is not a text"));
                 }
                 last = last.max(by);
                 Which::Named {
@@ -71,7 +71,7 @@ impl Inside {
                 }
             }
             Part::Slice { .. } | Part::Inside { .. } => {
-                return Err(fault("gives a field of one message, and not of several"));
+                return Err(fault("selects a field of a single message, not of several"));
             }
         };
         // The values of messages in the message would be counted among its own values.

@@ -79,7 +79,7 @@ impl<'m> Given<'m> {
                 };
                 Err(self.fault(
                     text,
-                    "possible here: arrays of messages have no constant but []",
+                    "possible here: [] is the only constant of an array of messages",
                 ))
             }
         }
@@ -118,7 +118,7 @@ impl<'m> Given<'m> {
                 return "possible here: a time cannot be a constant".to_owned();
             }
             Primitive::Clock(Clock::Duration1 | Clock::Duration2) => {
-                "a duration with its unit, as 500ms or 2s".to_owned()
+                "a duration with its unit, such as 500ms or 2s".to_owned()
             }
             Primitive::Text(_) => "a text".to_owned(),
         };

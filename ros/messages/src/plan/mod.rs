@@ -197,7 +197,7 @@ impl Plan {
                     return Err(PlanError::Shape {
                         name: message.name().clone(),
                         path: at.to_owned(),
-                        what: "is no message, and only a message is a structure",
+                        what: "is not a message, and only a message can be a structure",
                     });
                 };
                 let inner = match path {

@@ -132,7 +132,9 @@ impl Shaped {
             .and_then(|at| message.leaves().get(at));
         let Some(leaf) = leaf else {
             range(message, field)?;
-            return Err(fault("is a message, and only one value is converted"));
+            return Err(fault(
+                "is a message, and only a single value can be converted",
+            ));
         };
         let inside = match part {
             Some(Part::Inside { of, field: inner }) => {
@@ -157,7 +159,7 @@ impl Shaped {
             if !texts {
                 index(message, &by)?;
                 return Err(fault(
-                    "is to be found by a field that is no array of strings",
+                    "is selected by a field that is not an array of strings",
                 ));
             }
             names = Some(steps(&Selection::Field(by))?);
@@ -294,7 +296,7 @@ fn shape((leaf, bytes): (&Leaf, Option<u32>), part: Option<&Part>) -> Result<Lea
         Leaf {
             builtin: BuiltinType::ExtensionObject,
             ..
-        } => return Err("is an array of messages, of which no part can be taken"),
+        } => return Err("is an array of messages, and no part of it can be selected"),
         // An array of bytes.
         Leaf {
             builtin: BuiltinType::ByteString,
@@ -302,7 +304,7 @@ fn shape((leaf, bytes): (&Leaf, Option<u32>), part: Option<&Part>) -> Result<Lea
         } => (BuiltinType::Byte, bytes),
         Leaf {
             rank: Rank::Scalar, ..
-        } => return Err("is no array"),
+        } => return Err("is not an array"),
         Leaf {
             builtin,
             rank: Rank::Array { fixed },
@@ -315,7 +317,7 @@ fn shape((leaf, bytes): (&Leaf, Option<u32>), part: Option<&Part>) -> Result<Lea
         Part::Named { .. } | Part::Inside { .. } => 0,
     };
     if fixed.is_some_and(|fixed| first >= fixed) {
-        return Err("has fewer elements, always");
+        return Err("always has fewer elements");
     }
     let (builtin, rank) = match (part, leaf.rank) {
         // Handled by the caller.

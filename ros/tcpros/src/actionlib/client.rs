@@ -251,12 +251,10 @@ impl ActionClient {
         };
         if !takes(|outputs| &outputs.goal) {
             Err(missing(
-                "the server has not connected for goals, or wants them of another type",
+                "the server has not connected to the goal topic, or uses another goal type",
             ))
         } else if !takes(|outputs| &outputs.cancel) {
-            Err(missing(
-                "the server has not connected for requests to cancel",
-            ))
+            Err(missing("the server has not connected to the cancel topic"))
         } else {
             Ok(server.to_owned())
         }
@@ -320,7 +318,7 @@ pub enum CancelSent {
 
 /// A goal with that id has a handle already.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
-#[error("there is a goal `{id}` already")]
+#[error("a goal `{id}` already exists")]
 pub struct IdInUse {
     id: String,
 }

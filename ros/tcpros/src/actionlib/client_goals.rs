@@ -102,14 +102,14 @@ pub struct GoalResult {
 pub enum LostReason {
     /// No node subscribes to the goals.
     #[error(
-        "the goal was sent to nobody: no node subscribes to {topic}; start the action's server or check its name"
+        "the goal was not sent: no node subscribes to {topic}; start the action server, or check its name"
     )]
     NoServer {
         /// The resolved topic.
         topic: String,
     },
     /// The goal was sent and was never in a status of a server.
-    #[error("no server has taken the goal on within {0:?}")]
+    #[error("no server accepted the goal within {0:?}")]
     NotAcknowledged(Duration),
     /// The server is connected and sends no status.
     #[error("the server {server} has sent no status for {silence:?}")]
@@ -369,11 +369,11 @@ impl ClientGoals {
             .filter_map(|(node, server)| Some((server.last_status?, node, server)))
             .max_by_key(|(at, ..)| *at);
         match latest {
-            None => Err("no status of a server has come"),
+            None => Err("no server has published its status"),
             Some((_, _, server)) if server.feedback == 0 => Err("the server publishes no feedback"),
             Some((_, _, server)) if server.result == 0 => Err("the server publishes no result"),
             Some((_, _, server)) if !server.is_settled(now) => {
-                Err("the server has sent no status after it was connected")
+                Err("the server has not published its status since the connection")
             }
             Some((_, node, _)) => Ok(node),
         }

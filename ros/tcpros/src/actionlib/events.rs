@@ -28,7 +28,7 @@ impl Faults {
 
     pub(super) fn malformed(&mut self, topic: &str, node: &str, error: &dyn Display) {
         if let Some(more) = self.malformed.admit(clock::now()) {
-            warn!(topic, node, %error, more, "a message of an action does not read and is dropped");
+            warn!(topic, node, %error, more, "dropped a malformed message of an action");
         }
     }
 
@@ -45,7 +45,7 @@ impl Faults {
         if let Some(more) = self.full.admit(clock::now()) {
             warn!(
                 goal,
-                more, "a goal or a request to cancel was turned away: too many are open"
+                more, "rejected a goal or a cancel request: too many are open"
             );
         }
     }

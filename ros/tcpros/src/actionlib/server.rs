@@ -496,5 +496,5 @@ fn send(publisher: &Publisher, message: Bytes) {
 }
 
 const SHORTEST_PERIOD: Duration = Duration::from_millis(1);
-const DROPPED: &str = "the server gave the goal up without a result";
+const DROPPED: &str = "the server abandoned the goal without a result";
 const SERVER_CLOSED: &str = "the server was stopped";

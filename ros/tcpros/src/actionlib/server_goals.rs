@@ -38,7 +38,7 @@ pub enum GoalError {
         wanted: &'static str,
     },
     /// The goal has ended and left the status of the server.
-    #[error("the goal has ended and is forgotten")]
+    #[error("the goal has ended and expired")]
     Forgotten,
     /// The server was dropped, which has ended its goals.
     #[error("the action server was closed")]

@@ -74,4 +74,4 @@ impl SimpleActionServer {
     }
 }
 
-const SUPERSEDED: &str = "another goal took its place";
+const SUPERSEDED: &str = "another goal replaced it";

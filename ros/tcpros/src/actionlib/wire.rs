@@ -18,7 +18,7 @@ use crate::time::RosTime;
 /// Error for a message of an action that cannot be decoded: the message ends within the named
 /// field, or the field is not UTF-8.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
-#[error("the message's {0} is cut short or no text")]
+#[error("the {0} of the message is truncated or not a text")]
 pub(super) struct Malformed(&'static str);
 
 /// A received GoalStatus with an unchecked code.

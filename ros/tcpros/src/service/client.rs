@@ -328,7 +328,7 @@ impl Shared {
             AnswerError::Io(source) => self.lost(phase, source),
             AnswerError::OkByte(byte) => self.malformed(
                 phase,
-                format!("the answer begins with {byte}, not with 0 or 1"),
+                format!("the response begins with {byte}, not with 0 or 1"),
             ),
             AnswerError::TooLong(FrameTooLong { announced, limit }) => {
                 ServiceError::AnswerTooLong {
@@ -441,7 +441,7 @@ enum AnswerError {
     Io(#[from] io::Error),
     #[error(transparent)]
     TooLong(#[from] FrameTooLong),
-    #[error("{0} is no ok byte")]
+    #[error("{0} is not a valid ok byte")]
     OkByte(u8),
 }
 
@@ -467,13 +467,13 @@ impl fmt::Display for CallPhase {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Queue => "waiting for earlier calls to the same service",
-            Self::Lookup => "asking the master for it",
+            Self::Lookup => "looking it up at the master",
             Self::Connect => {
-                "connecting to it (if its node is gone, `rosnode cleanup` removes it from the master)"
+                "connecting to it (if its node has died, remove it from the master with `rosnode cleanup`)"
             }
             Self::Handshake => "exchanging connection headers",
             Self::Request => "sending the request",
-            Self::Answer => "waiting for the answer",
+            Self::Answer => "waiting for the response",
         })
     }
 }
@@ -483,13 +483,13 @@ impl fmt::Display for CallPhase {
 #[non_exhaustive]
 pub enum ServiceError {
     /// The master knows no node that offers the service.
-    #[error("no node offers {service}: `rosservice list` shows what the master knows")]
+    #[error("no node offers {service}: `rosservice list` shows the registered services")]
     NotAdvertised {
         /// The resolved service.
         service: String,
     },
     /// The call to the master failed.
-    #[error("the ROS master at {uri} could not be asked where {service} is: {source}")]
+    #[error("cannot look up {service} at the ROS master at {uri}: {source}")]
     Master {
         /// The resolved service.
         service: String,
@@ -502,8 +502,9 @@ pub enum ServiceError {
     /// No server listens at the registered address of the service, or its host name does not
     /// resolve.
     #[error(
-        "no connection to {host}:{port}, where the master says {service} is: {source}. If that node is gone, \
-         `rosnode cleanup` removes it from the master; if it runs, check that {host} resolves and is reached from here"
+        "cannot connect to {host}:{port}, the registered address of {service}: {source}. If the node has \
+         died, remove it from the master with `rosnode cleanup`; if it runs, check that {host} resolves and \
+         is reachable from this host"
     )]
     NoConnection {
         /// The resolved service.
@@ -526,7 +527,7 @@ pub enum ServiceError {
         message: String,
     },
     /// The server accepted the connection, and its header contains another type.
-    #[error("{service} has the type {theirs}, and {ours} is wanted")]
+    #[error("{service} has the type {theirs}, but {ours} is required")]
     OtherType {
         /// The resolved service.
         service: String,
@@ -544,7 +545,7 @@ pub enum ServiceError {
         message: String,
     },
     /// The time limit of the call has passed.
-    #[error("{service}: the call was given up after {limit:?} while {phase}")]
+    #[error("{service}: no response within {limit:?}, while {phase}")]
     Timeout {
         /// The resolved service.
         service: String,
@@ -565,7 +566,7 @@ pub enum ServiceError {
         source: io::Error,
     },
     /// The length of the request exceeds the wire format.
-    #[error("a request of {bytes} bytes for {service} is longer than TCPROS can say")]
+    #[error("a request of {bytes} bytes for {service} exceeds the length limit of TCPROS")]
     RequestTooLong {
         /// The resolved service.
         service: String,
@@ -573,7 +574,7 @@ pub enum ServiceError {
         bytes: usize,
     },
     /// The response is longer than the options allow.
-    #[error("the answer of {service} has {announced} bytes, more than the limit of {limit}")]
+    #[error("the response of {service} has {announced} bytes, more than the limit of {limit}")]
     AnswerTooLong {
         /// The resolved service.
         service: String,

@@ -160,7 +160,7 @@ pub(crate) enum Admitted {
 impl Served {
     #[expect(
         clippy::too_many_arguments,
-        reason = "all that a service is, named by the only caller"
+        reason = "the properties of a service, given by the only caller"
     )]
     pub(crate) fn new<H, F>(
         service: String,
@@ -381,7 +381,7 @@ impl Session {
                 Ok(result) => return result,
                 Err(_) => "its handler panicked".to_owned(),
             },
-            () = sleep(limit) => format!("its handler gave no answer within {limit:?}"),
+            () = sleep(limit) => format!("its handler did not respond within {limit:?}"),
             () = self.overdue() => "it is being withdrawn".to_owned(),
         };
         if let Some(more) = lock(&self.served.faults).admit(clock::now()) {
@@ -400,7 +400,7 @@ impl Session {
         let (ok, body) = match result {
             Ok(body) if too_long(&body) => (
                 0,
-                Bytes::from_static(b"the answer is longer than TCPROS can say"),
+                Bytes::from_static(b"the response exceeds the length limit of TCPROS"),
             ),
             Ok(body) => (1, body),
             Err(text) => (0, Bytes::from(text)),
@@ -446,10 +446,10 @@ pub(crate) enum ClientFault {
     TooLong(#[from] FrameTooLong),
     #[error("it closed the connection within a request")]
     Half,
-    #[error("it sent nothing of its request for {0:?}")]
+    #[error("it sent no part of its request for {0:?}")]
     Silent(Duration),
     #[error("its request was cut off: {0}")]
     Io(#[from] std::io::Error),
-    #[error("it did not take the answer: {0}")]
+    #[error("it did not receive the response: {0}")]
     Answer(Ended),
 }

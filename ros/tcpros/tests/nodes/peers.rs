@@ -346,14 +346,14 @@ async fn a_forged_list_of_publishers_is_followed_in_part_and_summed_up_in_the_lo
          <value>/t</value></param><param><value><array><data>{uris}</data></array></value></param></params></methodCall>"
     );
     assert!(slave_call(&listener, &update).await.contains("<i4>1</i4>"));
-    let named = || log.count("no connection to a registered publisher");
+    let named = || log.count("cannot connect to a registered publisher");
     eventually("the sum", || {
-        let summed_up = log.count("more registered publishers cannot be connected to") == 1;
+        let summed_up = log.count("cannot connect to further registered publishers") == 1;
         summed_up && named() == 20
     })
     .await;
     assert_eq!(
-        log.count("a topic has more publishers than are connected to"),
+        log.count("ignored publishers of a topic above the limit"),
         1
     );
 }

@@ -111,16 +111,16 @@ pub enum RequestDrop {
     #[error("{0} bytes of CorrelationData")]
     CorrelationData(usize),
     /// Another request has the same ids.
-    #[error("the ids of another request")]
+    #[error("the ids belong to another request")]
     Reused,
     /// The request is finished and gets no further response.
-    #[error("a request that is over")]
+    #[error("the request has already ended")]
     Over,
     /// The sender has reached its limit.
     #[error("too many requests of this sender")]
     SenderFull,
     /// The request was refused before.
-    #[error("a request that was refused")]
+    #[error("the request was refused")]
     Refused,
     /// The group has reached its limit.
     #[error("too many requests")]
@@ -132,7 +132,7 @@ pub enum RequestDrop {
 #[non_exhaustive]
 pub enum FinishRefusal {
     /// The request has expired: its deadline is long past.
-    #[error("the request was forgotten")]
+    #[error("the request has expired")]
     Forgotten,
     /// The request has its outcome already.
     #[error("finished before")]
@@ -141,14 +141,14 @@ pub enum FinishRefusal {
     #[error("abandoned by the requestor")]
     Abandoned,
     /// The response is too big. The Requestor receives Bad_ResponseTooLarge.
-    #[error("the answer is too big")]
+    #[error("the response is too large")]
     TooBig,
     /// The dialect does not support the encoding of the response. The Requestor receives
     /// Bad_EncodingError.
-    #[error("the answer is in an encoding the peer does not know")]
+    #[error("the peer does not support the encoding of the response")]
     Encoding,
     /// The dialect has no field for a StatusCode: the Requestor receives nothing.
-    #[error("the peer cannot be told a status")]
+    #[error("the peer does not support a status")]
     NoStatus,
 }
 
