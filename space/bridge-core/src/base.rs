@@ -163,7 +163,7 @@ fn merged(
         }
         let count = fields.len();
         let Some(field) = fields.get_mut(usize::from(entry.index)) else {
-            let detail = format!("field {} of a DataSet that has {count}", entry.index);
+            let detail = format!("field {} of a DataSet with {count} fields", entry.index);
             return Err((Reason::Malformed, detail));
         };
         *field = entry.value;

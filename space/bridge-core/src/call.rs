@@ -394,9 +394,9 @@ impl CallDescription {
                 is_left_out.then(|| Origin::Constant(constant::NULL.to_vec()))
             });
             found.ok_or_else(|| match path == field.name {
-                true => format!("its request has {field}, and {} has not", message.name()),
+                true => format!("its request has the field {field}, which {} lacks", message.name()),
                 false => format!(
-                    "its request has {field}, which is to be made of `{path}`, and {} has no such field of that type",
+                    "its request takes {field} from `{path}`, but {} has no such field of this type",
                     message.name()
                 ),
             })
@@ -408,7 +408,7 @@ impl CallDescription {
             .find(|(at, _)| !order.contains(&Origin::Leaf(*at)));
         match missing {
             Some((_, leaf)) if map.is_empty() => Err(format!(
-                "{} has `{}`, and its request has not",
+                "{} has the field `{}`, which its request lacks",
                 message.name(),
                 leaf.path
             )),
@@ -443,7 +443,7 @@ impl CallDescription {
             order.push(found.ok_or_else(|| {
                 let kind = kind(leaf.builtin, leaf.rank);
                 format!(
-                    "{} has `{}` ({kind}), and its response has no `{path}` of that type",
+                    "{} has the field `{}` ({kind}), but its response has no `{path}` of this type",
                     message.name(),
                     leaf.path,
                 )

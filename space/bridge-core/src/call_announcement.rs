@@ -410,7 +410,7 @@ fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, Str
         }
         let builtin = field
             .builtin_type()
-            .ok_or_else(|| format!("{} is no builtin type", field.built_in_type))?;
+            .ok_or_else(|| format!("{} is not a builtin type", field.built_in_type))?;
         let optional = field.properties.iter().any(|property| {
             property.key == OPTIONAL && property.value == Variant::Scalar(Scalar::Boolean(true))
         });

@@ -92,7 +92,7 @@ pub(crate) fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause
                 }
             };
             let missing = || {
-                let detail = format!("field {place} is missing, there are {}", all.len());
+                let detail = format!("field {place} is missing: {} fields are present", all.len());
                 ((Reason::Mismatch, "missing").into(), detail)
             };
             let field = all.get(place).ok_or_else(missing)?;

@@ -25,9 +25,9 @@ pub(crate) fn block(
         (Literal::One(text), Rank::Scalar, _) => std::slice::from_ref(text),
         (Literal::List(texts), Rank::Scalar, BuiltinType::ByteString) => {
             let numbers = texts.iter().map(|text| text.parse::<u8>());
-            let bytes: Vec<u8> = numbers
-                .collect::<Result<_, _>>()
-                .map_err(|_| format!("{field} is bytes, a list of numbers from 0 to 255"))?;
+            let bytes: Vec<u8> = numbers.collect::<Result<_, _>>().map_err(|_| {
+                format!("{field} takes bytes: give a list of numbers from 0 to 255")
+            })?;
             return encode(|frame| frame.scalar(Scalar::ByteString(Some(&bytes))));
         }
         (Literal::List(texts), Rank::Array { fixed }, _)
@@ -38,13 +38,13 @@ pub(crate) fn block(
         (Literal::List(_), Rank::Array { .. }, _) => {
             return Err(format!("{field} has another number of elements"));
         }
-        (Literal::List(_), Rank::Scalar, _) => return Err(format!("{field} is no list")),
+        (Literal::List(_), Rank::Scalar, _) => return Err(format!("{field} does not take a list")),
         (Literal::One(_), Rank::Array { .. }, _) => {
-            return Err(format!("{field} is a list, as [1, 2]"));
+            return Err(format!("{field} takes a list, such as [1, 2]"));
         }
     };
     let values = texts.iter().map(|text| {
-        scalar(builtin, text).ok_or_else(|| format!("`{text}` is no value of {field}"))
+        scalar(builtin, text).ok_or_else(|| format!("`{text}` is not a valid value of {field}"))
     });
     let values: Vec<Scalar<'_>> = values.collect::<Result<_, _>>()?;
     encode(|frame| match rank {

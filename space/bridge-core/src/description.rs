@@ -134,7 +134,7 @@ fn read_field(field: &FieldMetaData<'_>) -> Result<Leaf, String> {
         return Err("the name of a field is too long".to_owned());
     }
     let Some(builtin) = field.builtin_type() else {
-        return Err(format!("{} is no builtin type", field.built_in_type));
+        return Err(format!("{} is not a builtin type", field.built_in_type));
     };
     Ok(Leaf {
         path: path.to_owned(),
@@ -153,7 +153,9 @@ pub(crate) fn read_rank(field: &FieldMetaData<'_>) -> Result<Rank, String> {
         1 => Ok(Rank::Array {
             fixed: field.array_dimensions.get(0).filter(|length| *length > 0),
         }),
-        other => Err(format!("a field of ValueRank {other}, which ROS has not")),
+        other => Err(format!(
+            "a field has ValueRank {other}, which ROS does not support"
+        )),
     }
 }
 

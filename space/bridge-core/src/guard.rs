@@ -254,7 +254,7 @@ impl Guard {
             return Err(Unopened {
                 reason: Reason::Replayed,
                 case: "own",
-                detail: "somebody sends again what this program has sent".to_owned(),
+                detail: "another program repeats a message of this program (replay)".to_owned(),
             });
         }
         let Some(Group {
@@ -297,7 +297,7 @@ impl Guard {
         let message = NetworkMessage::decode(datagram).map_err(|error| Unopened {
             reason: Reason::Malformed,
             case: "seal",
-            detail: format!("what is to be sent is no message: {error}"),
+            detail: format!("cannot secure a malformed message: {error}"),
         })?;
         let data = message.message_type() == NetworkMessageType::DataSet;
         let namespace = message.group().and_then(|group| group.writer_group_id);
@@ -308,7 +308,7 @@ impl Guard {
             return Err(Unopened {
                 reason: Reason::NoKeys,
                 case: "mark",
-                detail: "no random bytes to seal with".to_owned(),
+                detail: "no random bytes for securing the message".to_owned(),
             });
         };
         let Some(Group {
@@ -326,7 +326,7 @@ impl Guard {
         let seal = secured.sealer.seal(mark).map_err(|error| {
             failed(if error == SealError::NoKeys {
                 format!(
-                    "there are no keys of the group `{}` yet, so nothing is sent in it",
+                    "no keys of the group `{}` yet, so this program sends nothing in it",
                     described.id
                 )
             } else {
@@ -458,7 +458,7 @@ fn unopened(error: SecurityError, group: &str) -> Unopened {
     Unopened {
         reason,
         case,
-        detail: format!("{error}, and what is sent in it belongs to the group `{group}`"),
+        detail: format!("{error}; its content belongs to the secured group `{group}`"),
     }
 }
 

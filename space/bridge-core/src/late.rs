@@ -64,7 +64,7 @@ fn aged(time: Timestamp, now: Timestamp, within: Duration) -> Option<Late> {
         true => (
             "old",
             format!(
-                "it was sent {millis} ms ago, and at most {within} ms are allowed; is the broker slow, or do the clocks differ?"
+                "it was sent {millis} ms ago, but at most {within} ms are allowed; the broker is slow, or the clocks of the hosts differ"
             ),
         ),
         false => (

@@ -46,7 +46,7 @@ impl Layout {
                 return Err("the name of a field is too long".to_owned());
             }
             let Some(builtin) = field.builtin_type() else {
-                return Err(format!("{} is no builtin type", field.built_in_type));
+                return Err(format!("{} is not a builtin type", field.built_in_type));
             };
             if field.array_dimensions.len() > MAX_DIMENSIONS {
                 return Err(format!("a field of more than {MAX_DIMENSIONS} dimensions"));

@@ -32,7 +32,7 @@ impl Transcoder {
         let name = local.name();
         let (there, here) = (label(origin), label(local.dialect()));
         let why = |error: String| {
-            format!("{there} messages come as bytes and {here} {name} is wanted: {error}")
+            format!("{there} messages arrive as bytes, but {here} requires {name}: {error}")
         };
         let foreign = Registry::bundle(origin)
             .get(name)
@@ -64,7 +64,7 @@ impl Transcoder {
         let (Some(Ok(Variant::Scalar(Scalar::ByteString(bytes)))), None) =
             (fields.next(), fields.next())
         else {
-            let detail = "a message as bytes is one ByteString, and this is something else";
+            let detail = "expected a message as bytes, which is one ByteString";
             return Err((Reason::Mismatch.into(), detail.to_owned()));
         };
         let too_big = |error: uadp::EncodeError| (Reason::TooBig.into(), error.to_string());

@@ -149,7 +149,7 @@ fn a_joint_by_its_name_crosses_in_thousandths_and_comes_out_in_radians() {
 fn a_message_without_the_joint_or_with_too_big_a_value_is_dropped_and_told() {
     let state = joint_state(&["shoulder"], &[1.0]);
     let why = cross("ua_1_2_10", &state).unwrap_err();
-    assert_eq!(why, "field `position`: no element is named `elbow`");
+    assert_eq!(why, "field `position`: no element has the name `elbow`");
     let state = joint_state(&["elbow"], &[1e9]);
     let why = cross("ua_1_2_10", &state).unwrap_err();
     assert_eq!(why, "field `position`: 1000000000000 does not fit Int32");

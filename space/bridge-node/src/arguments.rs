@@ -7,41 +7,41 @@ use clap::FromArgMatches;
 
 use crate::logging::LogFormat;
 
-/// Flags win over `UA_*` environment variables, which win over the mapping.
+/// Flags take precedence over `UA_*` environment variables, which take precedence over the mapping.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Arguments {
-    /// The mapping YAML of the cell. Without one, topics named in the space cross, whatever their
-    /// type
+    /// The mapping YAML of the cell. Without a mapping, all topics with names of the space are
+    /// bridged, with any type
     #[arg(value_name = "MAPPING", env = "UA_MAPPING")]
     pub mapping: Option<PathBuf>,
     /// Check the mapping, print every finding, and exit
     #[arg(long)]
     pub check: bool,
-    /// All but the mapping.
+    /// All arguments except the mapping.
     #[command(flatten)]
     pub flags: Flags,
 }
 
-/// What programs take whether they have a mapping or not.
+/// The arguments of programs with or without a mapping.
 #[derive(Debug, Clone, clap::Args)]
 // A program may have a struct of that name too, and groups have the names of their structs.
 #[group(skip)]
 pub struct Flags {
-    /// Hear and decode, but publish nothing on either side
+    /// Receive and decode, but publish nothing on either side
     #[arg(long)]
     pub dry_run: bool,
     /// The network interface of the PubSub group, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     pub interface: Option<String>,
-    /// The PubSub group, as opc.udp://239.192.0.40:4840, or an MQTT broker, as
+    /// The PubSub group, such as opc.udp://239.192.0.40:4840, or an MQTT broker, such as
     /// mqtt://broker.local:1883
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub address: Option<String>,
-    /// Take the secured groups of this mapping YAML, its key `security`, in place of those of the
-    /// own configuration
+    /// Use the secured groups of this mapping YAML (its key `security`) instead of the groups of
+    /// the program's configuration
     #[arg(long, value_name = "MAPPING", env = "UA_SECURITY")]
     pub security: Option<PathBuf>,
-    /// How log lines look
+    /// The format of the log
     #[arg(
         long,
         value_name = "FORMAT",
@@ -50,11 +50,12 @@ pub struct Flags {
     )]
     pub log: LogFormat,
     /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON, and
-    /// whether the program can do its work: /readyz
+    /// /readyz for readiness
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     pub metrics: Option<SocketAddr>,
-    /// Where samples follow each other closely, look for the next one for so long before sleeping,
-    /// as 200. Takes up to one core while they do: only for a closed loop, with cores to spare
+    /// Microseconds of busy waiting for the next sample before sleeping, such as 200, while samples
+    /// follow each other closely. Uses up to one core: only for closed control loops on hosts with
+    /// spare cores
     #[arg(
         long,
         value_name = "MICROSECONDS",

@@ -208,7 +208,7 @@ impl Asker {
             answer.unwrap_or_else(|_| {
                 Err(AskFault {
                     kind: AskErrorKind::Unknown,
-                    text: "the call is not there any more".to_owned(),
+                    text: "the call was withdrawn".to_owned(),
                 })
             })
         }
@@ -221,7 +221,7 @@ impl Asker {
         let ask = AskId(self.next.fetch_add(1, Ordering::Relaxed));
         let place = || {
             let place = self.say.clone().try_reserve_owned();
-            place.map_err(|_| format!("more than {MOST_ASKED} calls of the space are under way"))
+            place.map_err(|_| format!("more than {MOST_ASKED} calls of the space are in progress"))
         };
         let (question, later) = (place()?, place()?);
         let (answer, answered) = oneshot::channel();
@@ -427,7 +427,10 @@ impl<S: Send> Calls<S> {
             if left == 0 {
                 known.state = State::Refused;
                 policy.told.once("", "too many calls", || {
-                    format!("more than {MOST_CALLS} calls of the space: the rest is not offered as services")
+                    format!(
+                        "more than {MOST_CALLS} calls of the space: the bridge does not offer the \
+                             others as services"
+                    )
                 });
                 continue;
             }
@@ -464,7 +467,7 @@ impl<S: Send> Calls<S> {
                 Err(why) => {
                     policy.told.once(&topic.to_string(), "no service", || {
                         let name = &known.described.name;
-                        format!("the call {name} cannot be asked for as a service: {why}")
+                        format!("the call {name} is not offered as a service: {why}")
                     });
                     State::Refused
                 }
@@ -576,7 +579,7 @@ impl<S: Send> Calls<S> {
 
 impl Asked {
     fn fail(self, kind: AskErrorKind, why: &str) {
-        debug!(topic = %self.topic, why, "a call came to nothing");
+        debug!(topic = %self.topic, why, "a call failed");
         let no = self.says_no.and_then(|response| no(&response, why));
         // The caller may have given up.
         let text = why.to_owned();
@@ -615,7 +618,7 @@ const CALLS_OF_ACTION: usize = 3;
 /// The maximal number of calls offered as services: any publisher in the space can announce calls.
 const MOST_CALLS: usize = 1024;
 /// The failure text for waiting callers of a lost call.
-const GONE: &str = "whoever executes the call is gone; it is not known whether it was executed";
+const GONE: &str = "the executor of the call is lost; it is unknown whether the call was executed";
 /// How long after the loss of a call the waiting callers receive the failure: the Router may still
 /// receive a response.
 const ANSWERED_AFTER: Duration = Duration::from_secs(1);

@@ -45,7 +45,7 @@ fn broker_of(url: Option<&str>, pubsub: &PubSub) -> Result<Option<Broker>, Failu
     }
     let address = BrokerAddress::parse(url).ok_or_else(|| {
         let example = BrokerAddress::EXAMPLE;
-        let message = format!("--address: not the address of a broker; for example {example}");
+        let message = format!("--address: expected the address of a broker, such as {example}");
         Failure::new(FailureKind::Usage, message)
     })?;
     Ok(Some(match pubsub.broker.as_deref() {
@@ -63,7 +63,7 @@ fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Op
     let address: SocketAddr = match &arguments.flags.address {
         Some(url) => PubSub::parse_address(url).ok_or_else(|| {
             let message = format!(
-                "--address {url}: for example opc.udp://{}, or {} for a broker",
+                "--address {url}: expected an address such as opc.udp://{}, or {} for a broker",
                 PubSub::ADDRESS,
                 BrokerAddress::EXAMPLE
             );
@@ -82,8 +82,8 @@ fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Op
     };
     if several && !address.ip().is_multicast() {
         let message = format!(
-            "several spaces in one program hear each other by multicast, and {address} is no multicast address: start \
-             a program for each"
+            "several spaces in one program need a multicast address, and {address} is not one: start a \
+             program for each space"
         );
         return Err(Failure::new(FailureKind::Usage, message));
     }

@@ -29,8 +29,8 @@ pub fn timestamp(at: SystemTime) -> Timestamp {
 pub(crate) fn fault(utc: Timestamp) -> Option<String> {
     let first_day = timestamp(UNIX_EPOCH + PLAUSIBLE);
     (utc < first_day).then(|| {
-        "the clock of this computer is not set (it shows a day before 2026): times of values are wrong, and certificates of \
-         others are not valid yet; set it, or wait for the time server"
+        "the clock of this host is not set (it shows a date before 2026): timestamps of values are wrong, \
+         and certificates of other programs are not valid yet; set the clock, or wait for the time server"
             .to_owned()
     })
 }

@@ -150,7 +150,7 @@ impl Definitions {
         };
         if let Some(file) = self.files.paths().file(other, kind, name) {
             return format!(
-                "{error}; {file} is of ROS {version} only, because the package.xml of its package names {tool} alone"
+                "{error}; {file} is for ROS {version} only, because the package.xml of its package names only {tool}"
             );
         }
         format!("{}; {wanted}", self.explain(kind, error))
@@ -208,7 +208,7 @@ fn tell_differing(name: &TypeName, file: &str, only_file: &[String], only_built_
         file,
         ?only_file,
         ?only_built_in,
-        "the file counts, and differs from the definition that is built in"
+        "using the definition of the file, which differs from the built-in definition"
     );
 }
 
@@ -253,7 +253,7 @@ mod tests {
             known.explain_missing((TextKind::Action, &name), &error, "provide it")
         };
         let there = told("robot_msgs/Turn");
-        let expected = "robot_msgs/action/Turn.action is of ROS 1 only, because the package.xml of its package names catkin alone";
+        let expected = "robot_msgs/action/Turn.action is for ROS 1 only, because the package.xml of its package names only catkin";
         assert!(there.ends_with(expected), "{there}");
         let missing = told("robot_msgs/Move");
         assert!(missing.ends_with("; provide it"), "{missing}");

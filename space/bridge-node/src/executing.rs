@@ -139,7 +139,7 @@ impl<C: ServiceCall + Sync> Executing<C> {
                 Err(why) => {
                     policy.told.once(&topic.to_string(), "not executed", || {
                         format!(
-                            "the service {} cannot be asked for from other spaces: {why}",
+                            "the service {} is not offered to other spaces: {why}",
                             wanted.service
                         )
                     });
@@ -169,7 +169,9 @@ impl<C: ServiceCall + Sync> Executing<C> {
         wanted: &Wanted,
     ) -> Result<PortEvent, String> {
         if self.served.len() >= MOST_SERVED {
-            return Err(format!("{MOST_SERVED} services are offered already"));
+            return Err(format!(
+                "the limit of {MOST_SERVED} offered services is reached"
+            ));
         }
         let service_type = graph.service_type(&wanted.type_name)?;
         let client = graph.executor(&wanted.service, &service_type, wanted.timeout)?;

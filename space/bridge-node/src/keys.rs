@@ -112,7 +112,8 @@ impl KeyRing {
                     }
                     (Some(KeySource::Own(_) | KeySource::Sks(_)), None) => warn!(
                         group = group.id,
-                        "this program fetches no keys from a Security Key Service: nothing is said or heard in the group"
+                        "this program cannot fetch keys from a Security Key Service: it sends and receives \
+                         nothing in the group; use a key file for the group"
                     ),
                     (Some(KeySource::File(_) | KeySource::Credential(_)) | None, _) => {
                         drop(tokio::spawn(watch_file(group.clone(), (out, wants))));

@@ -18,7 +18,7 @@ use tracing_subscriber::{EnvFilter, Layer};
 use self::limit::{PerCallsite, take_suppressed};
 use crate::clock;
 
-/// How log lines look.
+/// The format of the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum LogFormat {
     /// Lines for people; in colour on a terminal.

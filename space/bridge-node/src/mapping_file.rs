@@ -333,7 +333,10 @@ impl MappingFile {
             }
             None => Err(Failure::new(
                 FailureKind::Configuration,
-                format!("{} cannot run, see the findings above", file.display()),
+                format!(
+                    "{} has errors (see the findings above): correct them and start again",
+                    file.display()
+                ),
             )),
         }
     }
@@ -443,7 +446,7 @@ impl MappingFile {
         }
         let untold = kept.iter().filter(|why| asked || !self.told.contains(*why));
         for why in untold.take(MOST_TOLD) {
-            error!("{why}: the definitions of before count");
+            error!("{why}: the previous definitions stay in use");
         }
         self.told = kept.into_iter().collect();
         self.judge(&file, reading);
@@ -473,7 +476,7 @@ impl MappingFile {
         let about = Arc::make_mut(&mut self.running.about);
         error!(
             running = about.hash,
-            "{why}: nothing is changed, what runs stays as it is"
+            "{why}: the running mapping stays in use"
         );
         about.refused += 1;
         about.stale = Some(why);
@@ -485,8 +488,11 @@ impl MappingFile {
             return;
         };
         let about = Arc::make_mut(&mut self.running.about);
-        let why = format!("{} is gone or empty", file.display());
-        warn!(running = about.hash, "{why}: what runs stays as it is");
+        let why = format!("{} is missing or empty", file.display());
+        warn!(
+            running = about.hash,
+            "{why}: the running mapping stays in use"
+        );
         about.stale = Some(why);
         self.gone = true;
         self.hash.clear();
@@ -501,7 +507,7 @@ impl MappingFile {
             removed = difference.removed.len(),
             same = difference.same,
             definitions = reading.differing,
-            "{} was read again",
+            "reloaded {}",
             file.display()
         );
         let about = Arc::make_mut(&mut self.running.about);
@@ -525,7 +531,9 @@ fn reason(kept: &[String]) -> Option<String> {
         0 => String::new(),
         more => format!(" (and {more} more)"),
     };
-    Some(format!("the definitions of before count: {first}{more}"))
+    Some(format!(
+        "the previous definitions stay in use: {first}{more}"
+    ))
 }
 
 /// Logs findings, each with its remedy.

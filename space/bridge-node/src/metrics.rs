@@ -311,14 +311,14 @@ async fn page<T: Told>(
                 Some(site) => site.answer(request, visit).await,
                 None => text(
                     StatusCode::NOT_FOUND,
-                    "there are /metrics, /status and /readyz here\n".into(),
+                    "not found: this server has /metrics, /status and /readyz\n".into(),
                 ),
             };
         }
     };
     let all = statuses(&ask).await;
     if all.is_empty() || (page == Page::Ready && all.len() < ask.len()) {
-        let ending = "the program is ending\n".to_owned();
+        let ending = "the program is stopping\n".to_owned();
         return text(StatusCode::SERVICE_UNAVAILABLE, ending);
     }
     match page {

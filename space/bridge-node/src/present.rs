@@ -93,7 +93,7 @@ pub(crate) fn tell_other_types(policy: &mut Policy, present: &Present, kind: Cal
         {
             policy.told.once(&target.name, "other type", || {
                 format!(
-                    "the {noun} {} is not executed as {}: it is of type {type_name}, and the mapping says {}",
+                    "the {noun} {} is not executed as {}: its type is {type_name}, but the mapping says {}",
                     target.name, call.topic, target.type_name
                 )
             });

@@ -432,11 +432,11 @@ fn groups(arguments: &Arguments) -> Result<Option<Vec<SecurityGroup>>, Failure> 
     })?;
     let checked = Mapping::from_yaml(&text, &name);
     let Some(mapping) = checked.outline() else {
-        let message = format!("--security: {name} cannot run: `ua-space check {name}` says why");
+        let message = format!("--security: {name} has errors: `ua-space check {name}` shows them");
         return Err(Failure::new(FailureKind::Configuration, message));
     };
     if mapping.security().is_empty() {
-        let message = format!("--security: {name} has no `security`");
+        let message = format!("--security: {name} has no section `security`");
         return Err(Failure::new(FailureKind::Configuration, message));
     }
     Ok(Some(mapping.security().to_vec()))
@@ -447,7 +447,7 @@ fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Fail
     ended.unwrap_or(Ok(Ok(()))).unwrap_or_else(|error| {
         Err(Failure::new(
             FailureKind::Io,
-            format!("the program broke off: {error}"),
+            format!("the program failed: {error}"),
         ))
     })
 }

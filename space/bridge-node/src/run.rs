@@ -141,14 +141,14 @@ impl<P: Port> Shell<P> {
 
     fn log_unknown_outcomes(&self) {
         for pending in self.port.pending() {
-            warn!("ending, and the outcome is unknown: {pending}");
+            warn!("stopping with an unknown outcome, so check the machine: {pending}");
         }
     }
 
     fn log_end(&self) {
         let status = self.status();
         let [topics, sent, delivered, dropped] = status.summary();
-        info!(topics, sent, delivered, dropped, "ending");
+        info!(topics, sent, delivered, dropped, "stopping");
         debug!(status = %status.json(), "last status");
     }
 
@@ -302,7 +302,7 @@ impl<P: Port> Shell<P> {
     fn keyless(&self) -> impl Iterator<Item = String> {
         let groups = self.router.groups();
         let keyless = groups.filter(|state| state.token_id.is_none());
-        keyless.map(|state| format!("there are no keys of the group `{}` yet", state.group))
+        keyless.map(|state| format!("no keys of the group `{}` yet", state.group))
     }
 
     /// Follows the changes of the network interface of the group.
@@ -336,8 +336,8 @@ impl<P: Port> Shell<P> {
             let told = match finding {
                 Finding::Lost(why) => side_lost(why),
                 Finding::Late(interface) => format!(
-                    "the network interface {interface} came after the start: the ROS side does not use it until the \
-                     next start"
+                    "the network interface {interface} appeared after the start: the ROS side does not use \
+                     it until this program is restarted"
                 ),
                 Finding::Back(interface) => {
                     info!(%interface, "the network interface of the ROS side is up again");
@@ -345,7 +345,8 @@ impl<P: Port> Shell<P> {
                 }
                 Finding::Void(why) => {
                     let message = format!(
-                        "{why}, and the ROS side cannot go over to it: ending, to be started again"
+                        "{why}, and the ROS side cannot switch to it: stopping; the service manager should \
+                         restart this program"
                     );
                     return Err(Failure::new(FailureKind::Unavailable, message));
                 }
@@ -372,7 +373,7 @@ impl<P: Port> Shell<P> {
         self.restart.extend(self.port.reload(&mapping, &types));
         if !self.restart.is_empty() {
             warn!(
-                "restart needed: {} stay as they were; the rest of the mapping is taken",
+                "restart needed for changes of: {}; all other changes of the mapping are in use",
                 self.restart.join(", ")
             );
         }
@@ -447,7 +448,7 @@ impl<P: Port> Shell<P> {
             } => match self.router.bind(topic, &message_type, &selection, now()) {
                 Ok(()) => {
                     let name = self.name_of(topic);
-                    info!(%topic, message_type = %message_type.name(), name, "bound");
+                    info!(%topic, message_type = %message_type.name(), name, "bridging");
                 }
                 Err(error) => {
                     let name = self.name_of(topic);
@@ -485,14 +486,14 @@ impl<P: Port> Shell<P> {
     }
 
     fn unbound(&mut self, topic: TopicId) {
-        info!(%topic, "unbound");
+        info!(%topic, "stopped bridging");
         self.router.unbind(topic, now());
     }
 
     /// Carries out the outputs of the Router, up to a limit; returns whether more may be queued.
     #[expect(
         clippy::wildcard_enum_match_arm,
-        reason = "those of calls, and those this program does not know"
+        reason = "outputs of calls and unknown outputs"
     )]
     fn drain(&mut self) -> bool {
         for _ in 0..DRAINED_AT_ONCE {
@@ -542,7 +543,7 @@ impl<P: Port> Shell<P> {
                 }
                 Output::CommanderLost { topic } => {
                     let name = self.name_of(topic);
-                    warn!(%topic, name, "commander lost, `on_loss` is published");
+                    warn!(%topic, name, "the commander is lost: published the value of `on_loss`");
                 }
                 Output::Notice(notice) => {
                     let name = notice.topic.and_then(|topic| self.name_of(topic));
@@ -563,7 +564,7 @@ impl<P: Port> Shell<P> {
 
     fn silent(&mut self, topic: TopicId, silent: bool, dropped: Option<Reason>) {
         if let Some(reason) = dropped {
-            debug!(%topic, %reason, "its writer is heard, but its values are dropped");
+            debug!(%topic, %reason, "messages of the writer are received, but its values are dropped");
         }
         self.observe(|observer| observer.silent(topic, silent));
         self.port.silent(topic, silent);
@@ -586,7 +587,7 @@ impl<P: Port> Shell<P> {
                 return;
             };
             if let Err(error) = self.send(&Outgoing::new(&probe)) {
-                debug!(%error, "a probe was not sent");
+                debug!(%error, "cannot send a probe");
             }
         }
     }
@@ -603,7 +604,7 @@ impl<P: Port> Shell<P> {
         self.carrier.close();
         let closed = self.carrier.closed();
         if tokio::time::timeout(CLOSING, closed).await.is_err() {
-            debug!("the PubSub network did not confirm the end");
+            debug!("the PubSub network did not confirm the close");
         }
     }
 
@@ -672,7 +673,7 @@ fn group_lost(why: String) -> String {
 }
 
 fn side_lost(why: String) -> String {
-    format!("the ROS side is out of reach: {why}")
+    format!("the network of the ROS side is out of reach: {why}")
 }
 
 fn not_sent(error: SendError) -> Reason {

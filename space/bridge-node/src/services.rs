@@ -247,7 +247,7 @@ impl Services {
                 std::iter::once(event).chain(live).collect()
             }
             Err(error) => {
-                warn!(%topic, name = variable.name, "no service is called for this value: {error}");
+                warn!(%topic, name = variable.name, "calls no service for this value: {error}");
                 Vec::new()
             }
         }
@@ -552,7 +552,7 @@ fn bound(topic: TopicId, service_type: &ServiceType, selection: &Selection) -> P
 fn carrier(graph: &mut impl ServiceGraph, variable: &Variable) -> Result<Arc<MessageType>, String> {
     let (builtin, array) = variable
         .value_type
-        .ok_or("a variable whose value does not go into the request needs a `type`")?;
+        .ok_or("a variable needs a `type` if its value is not part of the request")?;
     graph
         .carrier(builtin, array)?
         .ok_or_else(|| format!("a value of type {builtin:?} cannot be compared with `when`"))

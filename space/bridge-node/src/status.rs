@@ -277,14 +277,19 @@ impl Status {
         self
     }
 
-    /// Returns the number of topics, and the numbers of samples sent, delivered and dropped.
+    /// Returns the number of topics, and the numbers of samples sent, delivered and dropped. Drops of
+    /// normal traffic, such as repetitions, are not counted.
     pub(crate) fn summary(&self) -> [u64; 4] {
         let all = || self.topics.values().chain([&self.others]);
+        let routine = Reason::ALL.into_iter().filter(|reason| reason.is_routine());
+        let routine: Vec<&str> = routine.map(Reason::label).collect();
+        let dropped = all().flat_map(|topic| &topic.dropped);
+        let dropped = dropped.filter(|(reason, _)| !routine.contains(reason));
         [
             self.topics.len().try_into().unwrap_or(u64::MAX),
             all().map(|topic| topic.sent).sum(),
             all().map(|topic| topic.delivered).sum(),
-            all().flat_map(|topic| topic.dropped.values()).sum(),
+            dropped.map(|(_, count)| count).sum(),
         ]
     }
 }
@@ -621,6 +626,8 @@ mod tests {
         let mut router = Router::new(settings, std::sync::Arc::new(mapping));
         let topic = "ua_1_2_10".parse().unwrap();
         router.set_live(topic, true, crate::clock::now());
+        router.lost(Some(topic), 3, (Reason::NoSubscriber, "no subscriber"));
+        router.lost(Some(topic), 2, (Reason::Overflow, "too slow"));
         let ready = Readiness {
             not_ready: Vec::new(),
             waiting_for: Vec::new(),
@@ -640,6 +647,9 @@ mod tests {
         assert_eq!(topic["name"], "Arm \"left\"");
         let ros = serde_json::json!([{"space": 1, "topic": "/joint_states"}]);
         assert_eq!(topic["ros_topics"], ros);
+        // The summary of the log leaves out drops of normal traffic.
+        assert_eq!(topic["dropped"]["no_subscriber"], 3);
+        assert_eq!(status.summary(), [1, 0, 0, 2]);
     }
 
     #[test]

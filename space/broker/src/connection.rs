@@ -62,7 +62,7 @@ pub(crate) enum Link {
 
 impl Default for Link {
     fn default() -> Self {
-        Self::Waiting("no connection was attempted yet".to_owned())
+        Self::Waiting("not connected yet".to_owned())
     }
 }
 
@@ -134,7 +134,7 @@ pub(crate) async fn run(
         }
         match ended {
             Ended::Lost(why) if !received.is_closed() && shared.waits(&why) => {
-                debug!(broker = %settings.broker.address, "no connection: {why}");
+                debug!(broker = %settings.broker.address, "cannot connect: {why}");
             }
             Ended::Lost(_) | Ended::Closed => return shared.closed(),
         }
@@ -277,7 +277,7 @@ impl<'a> Session<'a> {
                 }
                 () = sleep_until(timer) => {
                     if !connected && TokioInstant::now() >= accepted {
-                        return Ended::Lost("the broker does not answer".to_owned());
+                        return Ended::Lost("the broker does not respond".to_owned());
                     }
                     self.fire();
                 }
@@ -380,7 +380,7 @@ impl<'a> Session<'a> {
         let now = TokioInstant::now();
         if self.unanswered.is_some_and(|since| now >= since + STALL) {
             let seconds = STALL.as_secs();
-            self.over = Some(format!("the broker does not answer for {seconds} s"));
+            self.over = Some(format!("no response from the broker for {seconds} s"));
             return;
         }
         if self.is_connected() && now >= self.next_ping {
@@ -425,7 +425,7 @@ impl<'a> Session<'a> {
                     debug!(?error, "rejected a packet of the broker");
                 }
                 GenericEvent::RequestClose => {
-                    let why = "the broker violated the protocol, or refused it";
+                    let why = "the broker violated the protocol, or refused the protocol version";
                     self.over.get_or_insert_with(|| why.to_owned());
                 }
             }

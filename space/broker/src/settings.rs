@@ -43,7 +43,7 @@ pub enum OpenError {
         problem: String,
     },
     /// The host cannot be named in a certificate.
-    #[error("the host of the broker cannot be named in a certificate: {0}")]
+    #[error("the host of the broker is not valid in a certificate: {0}")]
     Host(#[from] InvalidDnsNameError),
     /// The client certificate and its key do not belong together.
     #[error("the client certificate cannot be used: {0}")]
@@ -138,7 +138,7 @@ fn tls(broker: &Broker) -> Result<Tls, OpenError> {
     if roots.is_empty() {
         return Err(OpenError::Content {
             path: path.to_owned(),
-            problem: "it has no certificate of an authority".to_owned(),
+            problem: "it contains no certificate of an authority".to_owned(),
         });
     }
     let config = ClientConfig::builder_with_provider(provider)

@@ -87,7 +87,7 @@ fn write_fields(
         )));
     }
     for (name, part) in fields {
-        let missing = || WrongValue::new(format!("the structure wants a field `{name}`"));
+        let missing = || WrongValue::new(format!("the structure lacks the field `{name}`"));
         let value = json.get(*name).ok_or_else(missing)?;
         let written = match part {
             Part::Value(builtin) => write_scalar(*builtin, value, out),

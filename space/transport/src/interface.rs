@@ -27,7 +27,7 @@ impl fmt::Display for Interface {
 #[non_exhaustive]
 pub enum InterfaceError {
     /// No interface has the requested name or address.
-    #[error("no network interface `{wanted}` here; there are: {present}")]
+    #[error("unknown network interface `{wanted}`; this host has: {present}")]
     Unknown {
         /// Requested name or address.
         wanted: String,
@@ -35,7 +35,7 @@ pub enum InterfaceError {
         present: String,
     },
     /// The system cannot list its interfaces.
-    #[error("the network interfaces cannot be listed: {0}")]
+    #[error("cannot list the network interfaces: {0}")]
     List(#[source] std::io::Error),
 }
 

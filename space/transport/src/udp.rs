@@ -59,7 +59,8 @@ pub enum OpenError {
     Ipv6(SocketAddr),
     /// Another program uses the port and does not share it.
     #[error(
-        "UDP port {} is taken by a program that does not share it (find it with `ss -ulpn`); end it or give another port",
+        "UDP port {} is in use by a program that does not share it (find it with `ss -ulpn`); stop it, or \
+         give another port",
         .0.port()
     )]
     PortTaken(SocketAddr),
@@ -76,7 +77,7 @@ pub enum OpenError {
         source: io::Error,
     },
     /// The unicast address to receive on is not an address of this host.
-    #[error("the address to listen at, {0}, is on no network interface here")]
+    #[error("no network interface of this host has the address {0}")]
     Gone(SocketAddr),
     /// Another error of the system.
     #[error("cannot {what} for {address}: {source}")]
@@ -104,7 +105,7 @@ pub enum SendError {
     #[error("the network is unreachable")]
     Unreachable,
     /// Another error of the system.
-    #[error("the system refused the datagram")]
+    #[error("the operating system refused the datagram")]
     Refused,
 }
 

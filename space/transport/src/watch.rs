@@ -108,14 +108,16 @@ impl Wanted {
         let (wanted, missing) = match self {
             Self::Named(wanted) => (
                 wanted.clone(),
-                format!("there is no network interface `{wanted}` with an IPv4 address here"),
+                format!("this host has no network interface `{wanted}` with an IPv4 address"),
             ),
             Self::Towards(group) => {
                 let source = source_towards(*group)
                     .map_err(|error| format!("no network interface leads to {group}: {error}"))?;
                 (
                     source.to_string(),
-                    format!("the address {source} towards {group} is on no network interface here"),
+                    format!(
+                        "no network interface of this host has the address {source}, which leads to {group}"
+                    ),
                 )
             }
         };
@@ -236,7 +238,7 @@ impl Held {
                 // The kernel removed its state together with the interface.
                 (State::Gone, State::There | State::Down) => {
                     findings.push(Finding::Void(format!(
-                        "the network interface {} is there anew",
+                        "the network interface {} was created again",
                         holding.interface
                     )));
                 }
@@ -266,7 +268,7 @@ impl Held {
             let mut of_name = self.held.iter().filter(|h| h.interface.name == one.name);
             if let Some(gone) = of_name.find(|h| h.state == State::Gone) {
                 findings.push(Finding::Void(if gone.interface.address == one.address {
-                    format!("the network interface {one} was made anew")
+                    format!("the network interface {one} was created again")
                 } else {
                     format!(
                         "the network interface {} has another address, {}",
@@ -275,7 +277,7 @@ impl Held {
                 }));
             } else if self.all && none_is_there {
                 findings.push(Finding::Void(format!(
-                    "the network interface {one} is there now"
+                    "the network interface {one} appeared"
                 )));
             } else if self.all && !self.late.contains(&one.name) && self.late.len() < MAX_LATE {
                 self.late.push(one.name.clone());
@@ -289,7 +291,7 @@ impl Held {
 impl Holding {
     fn why(&self) -> String {
         let state = match self.state {
-            State::Gone => "gone, or has another address",
+            State::Gone => "removed, or has another address",
             State::Down | State::There => "down",
         };
         format!("the network interface {} is {state}", self.interface)

@@ -217,7 +217,7 @@ impl Announcements {
         let Some(application) = Application::read(description, capabilities) else {
             let cause = (Reason::MetaData, "application");
             values.count(About::sender(from), cause, 1, || {
-                "it says what application it is, in words too long or that cannot be shown"
+                "its application announcement is too long or contains unprintable characters"
                     .to_owned()
             });
             return;
@@ -257,7 +257,7 @@ impl Announcements {
                 from: Some(from),
             };
             values.count(about, (Reason::MetaData, "sender"), 1, || {
-                "another program than the one that sends its values says that there is no such writer"
+                "a program that does not send its values reports that the writer does not exist"
                     .to_owned()
             });
         }
@@ -317,7 +317,7 @@ impl Announcements {
             Err(error) => {
                 *description = None;
                 values.count(About::topic(topic), Reason::MetaData, 1, || {
-                    format!("what it consists of cannot be announced: {error}")
+                    format!("cannot announce its fields: {error}")
                 });
                 return;
             }
@@ -431,7 +431,7 @@ impl Announcements {
             Some(Ok(()) | Err(_)) => {
                 values.recycle(bytes);
                 values.count(About::NOTHING, Reason::TooBig, 1, || {
-                    "what this program is does not fit a datagram".to_owned()
+                    "the announcement of this program does not fit into a datagram".to_owned()
                 });
             }
             None => values.recycle(bytes),

@@ -320,7 +320,8 @@ impl Router {
             )
         };
         if !self.values.may_cross(Side::Local, What::Request, topic) {
-            let text = format!("{topic} is executed here: nobody else can be asked");
+            let text =
+                format!("{topic} is executed by this program and cannot be called from here");
             return Err((
                 Reason::Looped.into(),
                 AskError::refused(Refusal::NoSuchAction, text),
@@ -328,7 +329,9 @@ impl Router {
         }
         if self.described_call(topic).is_none() {
             self.want_call(topic, now);
-            let text = format!("nobody executes {topic} now, as far as is known here");
+            let text = format!(
+                "no program offers {topic} at the moment; check that the executing bridge or component runs and uses this network"
+            );
             return Err(refuse(Refusal::NoSuchAction, "unknown", text));
         }
         let wire = self.wire();
@@ -337,7 +340,8 @@ impl Router {
         let since = calls.since_start(now);
         let call = calls.table.entry(topic).or_default();
         if call.open >= MAX_OPEN {
-            let text = format!("{MAX_OPEN} requests for {topic} at a time are all there may be");
+            let text =
+                format!("the limit of {MAX_OPEN} simultaneous requests for {topic} is reached");
             return Err(refuse(Refusal::Busy, "open", text));
         }
         let plan = match (wire, &call.bound) {
@@ -352,7 +356,7 @@ impl Router {
                     .map_err(|why| refuse(Refusal::InvalidArgument, "type", why))?,
             ),
             (Some(_), _) => {
-                let text = format!("{topic} is bound to no type here");
+                let text = format!("{topic} has no type here");
                 return Err(refuse(Refusal::NotExecutable, "unbound", text));
             }
         };
@@ -362,10 +366,7 @@ impl Router {
             .map_err(|(cause, text)| (cause, AskError::refused(Refusal::InvalidArgument, text)))?;
         let fields = block.as_deref().unwrap_or(request);
         if fields.len() > MAX_BLOCK {
-            let text = format!(
-                "{} bytes, and {MAX_BLOCK} are all there may be",
-                fields.len()
-            );
+            let text = format!("{} bytes exceed the limit of {MAX_BLOCK}", fields.len());
             return Err((
                 Reason::TooBig.into(),
                 AskError::refused(Refusal::TooBig, text),
@@ -502,7 +503,7 @@ impl Router {
             Ok(uadp::action::Heard::Executing(_) | uadp::action::Heard::Closed(_)) => {}
             Err(ResponseDrop::Elsewhere) => {
                 self.count_call(topic, Some(from), Reason::Forged, || {
-                    format!("{from} answers for {topic}, which it does not execute")
+                    format!("{from} responds for {topic}, but does not execute it")
                 });
             }
             // Responses go to the whole group, including responses to other requestors and repeated
@@ -524,13 +525,13 @@ impl Router {
                     Ok(()) => (Ok(response), None),
                     Err((cause, detail)) => {
                         let text =
-                            format!("it was executed, but its response cannot be read: {detail}");
+                            format!("it was executed, but its response is malformed: {detail}");
                         (failed(BAD_DECODING_ERROR, text), Some((cause, detail)))
                     }
                 }
             }
             Outcome::Answered { status, .. } => {
-                let text = format!("it was executed and went wrong: status 0x{:08X}", status.0);
+                let text = format!("it was executed and failed: status 0x{:08X}", status.0);
                 (failed(status, text), None)
             }
             Outcome::Refused(refusal) => {
@@ -749,7 +750,7 @@ fn unknown(why: Unknown) -> AskError {
     AskError {
         kind: AskErrorKind::Unknown,
         status: why.status_code(),
-        text: format!("whether it was executed is not known: {why}"),
+        text: format!("it is unknown whether it was executed: {why}"),
     }
 }
 

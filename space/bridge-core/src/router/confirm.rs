@@ -81,7 +81,7 @@ impl Router {
             self.announcements.probe_applications(now);
             let cause = (Reason::Forged, "confirmation");
             self.values.count_only(about, cause, 1, || {
-                format!("{from} confirms for space {space}, which it did not announce or another sender did first")
+                format!("{from} confirms for space {space}, but did not announce the space, or another sender announced it first")
             });
             return true;
         }

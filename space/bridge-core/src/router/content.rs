@@ -39,7 +39,7 @@ impl Choice {
             Self::One(Some(place)) | Self::Place(place) => usize::from(place),
             Self::One(None) => {
                 let detail = format!(
-                    "{count} fields where the mapping has one value: `ua_field` says which of them it is"
+                    "{count} fields, but the mapping has one value: choose the field with `ua_field`"
                 );
                 return Err((Reason::Mismatch, detail));
             }
@@ -47,7 +47,9 @@ impl Choice {
         if place < count {
             return Ok(Some(place));
         }
-        let detail = format!("field {place} is wanted of a message that has {count}, from 0 on");
+        let detail = format!(
+            "`ua_field` names field {place}, but the message has {count} fields, counted from 0"
+        );
         Err((Reason::Mismatch, detail))
     }
 }
@@ -196,7 +198,7 @@ impl Values {
             (_, Some(UaField::Name(name))) => {
                 let Some(layout) = announced() else {
                     let detail = format!(
-                        "`ua_field: {name}` takes the DataSetMetaData of its writer, which have not come"
+                        "`ua_field: {name}` needs the DataSetMetaData of the writer, which were not received yet"
                     );
                     return Err((Reason::Undescribed, detail));
                 };
@@ -243,7 +245,7 @@ impl Values {
             .variable(topic)
             .filter(|variable| variable.ua_field.is_none() && !variable.fields.is_empty())
         else {
-            return undescribed("RawData whose DataSetMetaData have not come");
+            return undescribed("RawData before the DataSetMetaData of the writer");
         };
         let layout = Layout::mapped(variable);
         fits(message.payload(), &layout)?;
@@ -279,7 +281,7 @@ impl Values {
         let owed = reader.owed;
         let base = reader.base.as_mut();
         let Some(base) = base.filter(|base| base.is_of(message, place.from)) else {
-            return no_key_frame("a delta frame, and the key frame it changes is not there");
+            return no_key_frame("a delta frame without its key frame");
         };
         let others = self.base_bytes.saturating_sub(base.weight());
         let done = base.merge(message, place, merged);
@@ -295,7 +297,7 @@ impl Values {
         let (done, one) = (done?, one?);
         if !is_sure {
             return no_key_frame(
-                "a delta frame behind a lost message, which may have changed what this one leaves out",
+                "a delta frame after a lost message, which may have changed other fields",
             );
         }
         let is_said = match one {
@@ -366,7 +368,7 @@ fn fits(payload: &[u8], layout: &Layout) -> Result<(), Refusal> {
         return Ok(());
     }
     let detail = format!(
-        "RawData of {} bytes, which are not the fields of the mapping, and no DataSetMetaData of its writer",
+        "RawData of {} bytes, which do not match the fields of the mapping, without DataSetMetaData of the writer",
         payload.len()
     );
     Err((Reason::Mismatch, detail))

@@ -108,7 +108,7 @@ impl Values {
         let mut payload = self.buffer();
         let written = match stop {
             Some(stop) => stop.write(now.utc, &mut payload),
-            None => Err(format!("the service of {by} is not known here", by = of)),
+            None => Err(format!("the service of {by} is unknown here", by = of)),
         };
         if let Err(detail) = written {
             self.recycle(payload);

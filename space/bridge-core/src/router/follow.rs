@@ -43,8 +43,8 @@ impl Values {
         if is_stray && !self.take_place(now) {
             self.count(About::sender(from), Reason::TooManyTopics, 1, || {
                 format!(
-                    "{topic} is not followed: more than {MAX_STRAYS} topics speak that the mapping does not name and \
-                     nobody here takes"
+                    "ignored {topic}: more than {MAX_STRAYS} topics are received that the mapping does not \
+                     name and that have no subscriber here"
                 )
             });
             return None;

@@ -71,9 +71,11 @@ impl Router {
             let about = About::sender(from);
             self.values.count(about, cause, 1, || match namespace {
                 Some(namespace) => {
-                    format!("it says in clear what is in namespace {namespace}, which is secured")
+                    format!("it is not secured, but its namespace {namespace} is")
                 }
-                None => "it says in clear what there is, and there are secured groups".to_owned(),
+                None => {
+                    "the announcement is not secured, but the mapping has secured groups".to_owned()
+                }
             });
         }
         unsaid

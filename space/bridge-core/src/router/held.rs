@@ -42,7 +42,7 @@ impl Values {
         }
         let cause = (Reason::NoRoom, "before its local type");
         self.count(About::topic(topic), cause, 1, || {
-            "other large samples that wait for their local types take up the room".to_owned()
+            "the limit of large samples that wait for their local types is reached".to_owned()
         });
     }
 

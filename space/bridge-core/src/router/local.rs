@@ -160,8 +160,7 @@ impl Values {
         if gave_way {
             self.count(About::topic(at.topic()), Reason::TooManyPublishers, 1, || {
                 format!(
-                    "it has more than {MAX_KEPT} latched publishers: late joiners get the last message of those that \
-                     spoke last"
+                    "it has more than {MAX_KEPT} latched publishers: late subscribers receive only the messages of the most recent publishers"
                 )
             });
         }

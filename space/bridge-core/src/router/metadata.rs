@@ -60,14 +60,14 @@ impl Values {
             && !self.may_be_renamed(topic, described, now)
         {
             self.count(about, (Reason::MetaData, "too often"), 1, || {
-                "its writer says too often that it is something else".to_owned()
+                "its writer changes its description too often".to_owned()
             });
             return;
         }
         match self.take_note(topic, described, now) {
             News::Same => {}
             News::Full => self.count(about, (Reason::MetaData, "no room"), 1, || {
-                "there is no room for what more topics consist of".to_owned()
+                "the limit of described topics is reached".to_owned()
             }),
             News::Other => {
                 self.topics.counters(Some(topic)).described += 1;
@@ -154,7 +154,7 @@ impl Values {
                 from: Some(from),
             };
             self.count(about, (Reason::MetaData, "sender"), 1, || {
-                "another program than the one that sends its values says what they are".to_owned()
+                "its description comes from a program that does not send its values".to_owned()
             });
         }
         false
@@ -172,7 +172,7 @@ impl Values {
         let until = (now.monotonic, self.mapping.pubsub().metadata_period);
         let rank = rank(&self.topics, &self.mapping, now.monotonic);
         match self.layouts.learn(topic, layout, until, rank) {
-            News::Full => Err("there is no room for what the fields of more topics are".to_owned()),
+            News::Full => Err("the limit of described topics with fields is reached".to_owned()),
             News::Same | News::Other => Ok(()),
         }
     }
@@ -231,7 +231,7 @@ impl Values {
         }
         if !fits {
             self.count(About::topic(topic), (Reason::MetaData, "values"), 1, || {
-                "its values are not what its writer says they are".to_owned()
+                "its values do not match the description of its writer".to_owned()
             });
         }
         Some(Output::Unbound {

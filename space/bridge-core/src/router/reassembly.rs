@@ -132,8 +132,7 @@ impl Chunks {
             };
             values.count(about, (reason, why(given_up.why)), 1, || {
                 format!(
-                    "of a message of {} bytes only {} came ({}); a larger receive buffer may help, see \
-                     net.core.rmem_max",
+                    "received only {1} of the {0} bytes of a message ({2}); a larger receive buffer may help, see net.core.rmem_max",
                     given_up.total_size,
                     given_up.received,
                     why(given_up.why)
@@ -153,9 +152,9 @@ fn topic_of(given_up: &GivenUp<SocketAddr>) -> Option<TopicId> {
 const fn why(why: GiveUp) -> &'static str {
     match why {
         GiveUp::Expired => "waited for until receive_timeout",
-        GiveUp::Superseded => "two newer ones of its writer were begun",
-        GiveUp::Contradicted => "its writer started over",
-        GiveUp::OutOfBytes => "unfinished messages of its sender took up all the bytes for them",
+        GiveUp::Superseded => "two newer messages of its writer started",
+        GiveUp::Contradicted => "its writer restarted",
+        GiveUp::OutOfBytes => "unfinished messages of its sender reached the limit of bytes",
         GiveUp::OutOfPlaces => "too many messages of its sender were unfinished",
     }
 }

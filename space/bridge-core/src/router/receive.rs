@@ -85,7 +85,8 @@ impl Router {
                     let cause = (Reason::CallRefused, "chunk");
                     self.values.count(About::sender(from), cause, 1, || {
                         format!(
-                            "{from} is another host, and no call of the namespace is open to others"
+                            "{from} is another host, and no call of the namespace is open to other hosts \
+                             (`open: true`)"
                         )
                     });
                 }
@@ -188,11 +189,11 @@ impl Values {
         self.count(About::sender(from), Reason::SpaceTaken, 1, || match shared {
             Some(_) if told => String::new(),
             Some(namespace) => format!(
-                "another program writes namespace {namespace} of space {own}: every sample is doubled; give one of \
-                 them another number"
+                "another program writes namespace {namespace} of space {own}, so every sample is sent \
+                 twice; give one of the programs another namespace"
             ),
             None => format!(
-                "another program sends as space {own}: every sample is doubled; end one of them"
+                "another program sends as space {own}, so every sample is sent twice; stop one of the programs"
             ),
         });
     }

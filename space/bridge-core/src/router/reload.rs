@@ -111,8 +111,10 @@ impl Router {
                 reader.held = None;
                 reader.shape = None;
                 reader.forget_all();
-                self.values
-                    .drop_deliveries(topic, "the mapping ties it to something else now");
+                self.values.drop_deliveries(
+                    topic,
+                    "the mapping binds it to another topic or service now",
+                );
             }
         }
     }

@@ -139,7 +139,7 @@ impl Security {
     /// Seals an output. Returns `None` for a message that cannot be sent, and counts it.
     #[expect(
         clippy::wildcard_enum_match_arm,
-        reason = "all but datagrams are for this program"
+        reason = "all messages except datagrams are addressed to this program"
     )]
     pub(super) fn seal(&mut self, values: &mut Values, output: Output) -> Option<Output> {
         let Some(guard) = &mut self.guard else {

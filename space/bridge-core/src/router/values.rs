@@ -157,7 +157,7 @@ impl Values {
         };
         reader.forget_all();
         let held = reader.held.take();
-        self.drop_deliveries(topic, "its local type is another now");
+        self.drop_deliveries(topic, "its local type has changed");
         if let Some(held) = held {
             self.deliver_held(at, &held, now);
         }

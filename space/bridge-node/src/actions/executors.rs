@@ -96,7 +96,7 @@ impl Executors {
                 Err(why) => {
                     policy.told.once(&topic.to_string(), "not executed", || {
                         format!(
-                            "the action {} cannot be asked for from other spaces: {why}",
+                            "the action {} is not offered to other spaces: {why}",
                             wanted.action
                         )
                     });
@@ -151,19 +151,21 @@ impl Executors {
         report: &mpsc::Sender<PortEvent>,
     ) -> Result<Vec<PortEvent>, String> {
         if self.served.len() >= MOST_SERVED {
-            return Err(format!("{MOST_SERVED} actions are offered already"));
+            return Err(format!(
+                "the limit of {MOST_SERVED} offered actions is reached"
+            ));
         }
         let (_, _, id) = topic.triple();
         let family = ActionFamily::behind(id);
-        let family =
-            family.ok_or("it takes five identifiers, and there are none behind its own")?;
-        let of = |id| beside(topic, id).ok_or("0 is no identifier");
+        let family = family
+            .ok_or("an action takes five consecutive identifiers, and fewer follow its own")?;
+        let of = |id| beside(topic, id).ok_or("0 is not an identifier");
         let (cancel, result) = (of(family.cancel)?, of(family.result)?);
         let (feedback, status) = (of(family.feedback)?, of(family.status)?);
         let all = [topic, cancel, result, feedback, status];
         if let Some(taken) = all.into_iter().find(|of| self.is_taken(mapping, *of)) {
             return Err(format!(
-                "it takes {topic} to {status}, and {taken} is a variable or part of another action"
+                "it takes the topics {topic} to {status}, but {taken} belongs to a variable or another action"
             ));
         }
         let calls = graph.action_calls(&wanted.type_name)?;

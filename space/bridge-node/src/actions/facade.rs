@@ -104,7 +104,7 @@ impl<A: ActionServer> Facade<A> {
             drop(self.report.try_send(PortEvent::Lost {
                 topic: Some(self.feedback),
                 reason: Reason::Overflow,
-                why: "goal is slow",
+                why: "goal is queued too long",
                 count: 1,
             }));
         }
@@ -114,9 +114,9 @@ impl<A: ActionServer> Facade<A> {
 /// Returns the reason why a goal is rejected, if it is.
 fn refusal(goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, id: GoalId) -> Option<&'static str> {
     if goals.contains_key(&id) {
-        return Some("there is a goal of that id");
+        return Some("a goal with this id already exists");
     }
-    (goals.len() >= MOST_GOALS).then_some("as many goals as may be are open")
+    (goals.len() >= MOST_GOALS).then_some("the limit of open goals is reached")
 }
 
 /// The channels through which a goal receives feedback.
@@ -146,7 +146,7 @@ async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
 /// Sends a goal to its executor, and accepts it in this graph once the executor has accepted it.
 async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
     let Some(request) = wire::join(asks.wire, id, new.body()) else {
-        new.reject("the goal does not read");
+        new.reject("the goal is malformed");
         return None;
     };
     if let Err(why) = send(asks, id, request).await {
@@ -203,7 +203,7 @@ async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
         Ok(answer) => match wire::read_goal_answer(asks.wire, &answer) {
             Some(answer) if answer.accepted => return Ok(()),
             Some(answer) => return Err(answer.message),
-            None => "the answer to the goal does not read".to_owned(),
+            None => "the response to the goal is malformed".to_owned(),
         },
         Err(AskFault {
             kind: AskErrorKind::Refused,
@@ -270,14 +270,14 @@ async fn wait(asks: &Asks, id: GoalId) -> End {
                 return match wire::read_outcome(asks.wire, &answer) {
                     Some(outcome) if outcome.status == UNKNOWN => End::aborted(or(
                         outcome.message,
-                        "who executes the action has lost the goal",
+                        "the executor of the action has lost the goal",
                     )),
                     Some(outcome) => End {
                         status: outcome.status,
                         message: outcome.message,
                         result: Some(outcome.result),
                     },
-                    None => End::aborted("the result does not read".to_owned()),
+                    None => End::aborted("the result is malformed".to_owned()),
                 };
             }
             Err(fault) => fault,
@@ -286,7 +286,7 @@ async fn wait(asks: &Asks, id: GoalId) -> End {
         // moment only, and after a restart it does not know them.
         if !returns(asks).await {
             return End::aborted(format!(
-                "who executes the action is gone; the goal may go on: {}",
+                "the executor of the action is lost; the goal may go on, so check the robot: {}",
                 fault.text
             ));
         }

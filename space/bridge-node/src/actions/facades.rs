@@ -258,7 +258,7 @@ impl Facades {
                 known.state = State::Refused;
                 policy.told.once("", "too many actions", || {
                     format!(
-                        "more than {MOST_OFFERED} actions of the space: the rest is not offered"
+                        "more than {MOST_OFFERED} actions of the space: the bridge does not offer the others"
                     )
                 });
                 continue;
@@ -266,7 +266,7 @@ impl Facades {
             let waits = policy.mapping().pubsub().receive_timeout;
             let with = (&asker, report, waits, tasks);
             let offered = match known.variable(topic, policy.mapping()) {
-                Some(variable) => Err(format!("its {variable} is a variable of the mapping")),
+                Some(variable) => Err(format!("its {variable} is also a variable of the mapping")),
                 None => known.offer(graph, (topic, target), with),
             };
             match offered {
@@ -277,7 +277,7 @@ impl Facades {
                 Err(why) => {
                     let name = &known.described.name;
                     policy.told.once(&topic.to_string(), "no action", || {
-                        format!("the action {name} cannot be asked for: {why}")
+                        format!("the action {name} is not offered: {why}")
                     });
                     known.state = State::Refused;
                 }
@@ -320,7 +320,7 @@ impl Facades {
         match &known.state {
             State::Offered(offered) if beside(of, known.family.feedback) == Some(value.topic) => {
                 let told = offered.feedback.try_send(value.payload.clone());
-                told.map_err(|_| "action is slow")
+                told.map_err(|_| "action events are queued too long")
             }
             // Statuses of goals are not forwarded: the server in this graph reports the statuses of
             // its own goals.
@@ -355,7 +355,7 @@ impl Known {
     ) -> Result<Vec<PortEvent>, String> {
         let said = (target.type_name.as_ref(), &*target.goal);
         let calls = action_type(&self.described, said, |name| graph.action_calls(name))?;
-        let of = |id| beside(topic, id).ok_or("its family has no such identifiers");
+        let of = |id| beside(topic, id).ok_or("it does not have five consecutive identifiers");
         let (cancel, result) = (of(self.family.cancel)?, of(self.family.result)?);
         let (feedback, status) = (of(self.family.feedback)?, of(self.family.status)?);
         let type_name = calls.goal().name().clone();

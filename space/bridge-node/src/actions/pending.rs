@@ -45,8 +45,8 @@ impl AllPending {
             lines.extend(goals.iter().map(|(id, since)| {
                 let age = now.saturating_duration_since(*since).as_secs_f64();
                 format!(
-                    "goal {} of {action}: cancellation pending for {age:.1} s, the action server has not decided about \
-                     the goal or not answered",
+                    "goal {} of {action}: cancellation pending for {age:.1} s: the action server has not \
+                     accepted or rejected the goal, or has not responded",
                     Hex(*id)
                 )
             }));

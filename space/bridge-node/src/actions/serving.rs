@@ -201,7 +201,7 @@ impl<C: ActionClient> Serving<C> {
             Wanted::Waits => Ok(()),
             Wanted::Answer(answer) => self.finish(run, answered(&answer)).await,
             Wanted::NoGoal => {
-                let outcome = self.no_result(UNKNOWN, "there is no such goal");
+                let outcome = self.no_result(UNKNOWN, "unknown goal");
                 self.finish(run, outcome).await
             }
             Wanted::Rejected(why) => {
@@ -295,7 +295,7 @@ impl<C: ActionClient> Serving<C> {
             let answer = timeout_at(deadline.into(), cancel_each(&*client, what)).await;
             let late = |_| {
                 Err(CallFault {
-                    text: "the server has not said in time whether it cancels".to_owned(),
+                    text: "the server did not respond to the cancellation in time".to_owned(),
                     may_pass: true,
                     ran: Ran::Perhaps,
                 })
@@ -396,7 +396,8 @@ impl<C: ActionClient> Serving<C> {
             GoalEvent::CancelRefused if !self.goals.cancel_refused(id) => Ok(()),
             GoalEvent::CancelRefused => {
                 self.tell_failure(format!(
-                    "the action server refuses to cancel the goal {}, which was withdrawn before it was accepted: it goes on",
+                    "the action server refuses to cancel the goal {}, which was withdrawn before it was \
+                     accepted: the goal continues; check the robot",
                     Hex(id)
                 ))
                 .await
@@ -435,7 +436,7 @@ impl<C: ActionClient> Serving<C> {
 
     async fn lost(&mut self, id: GoalId, text: String, ran: Ran) -> Result<(), Over> {
         if ran == Ran::No {
-            self.report_end(id, &format!("never sent: {text}"));
+            self.report_end(id, &format!("not sent: {text}"));
             let (asked, waiting) = self.goals.failed(id, &text, now().monotonic);
             let none = self.no_result(NEVER_RAN, &text);
             self.finish_all(asked, &failed(ran)).await?;
@@ -530,7 +531,7 @@ async fn follow<G: SentGoal>(id: GoalId, mut goal: G, tell: mpsc::Sender<News>) 
     let mut is_open = true;
     while is_open {
         let event = goal.recv().await.unwrap_or_else(|| GoalEvent::Lost {
-            text: "nothing more is heard of the goal".to_owned(),
+            text: "no further message about the goal was received".to_owned(),
             ran: Ran::Perhaps,
         });
         is_open = match &event {

@@ -764,13 +764,13 @@ async fn the_goals_of_a_bridge_that_is_gone_are_aborted_and_its_server_withdrawn
         let silent = AskError {
             kind: AskErrorKind::Unknown,
             status: StatusCode::GOOD,
-            text: "the responder is silent".to_owned(),
+            text: "the responder is lost".to_owned(),
         };
         space.calls.answered(ask, Err(silent));
     }
     let (status, why) = space.until(end).await;
     assert_eq!(status, 6);
-    assert!(why.contains("gone"), "{why}");
+    assert!(why.contains("the executor of the action is lost"), "{why}");
     let [_, policy] = &space.policies;
     space.offering.tidy(policy, now().monotonic);
     assert_eq!(space.served.lock().unwrap().len(), 1);

@@ -124,7 +124,7 @@ fn tell_back(request: &KeyRequest, failures: u32) {
         let (group, endpoint) = (&request.group, &request.endpoint);
         info!(
             group,
-            endpoint, failures, "the Security Key Service answers again"
+            endpoint, failures, "the Security Key Service responds again"
         );
     }
 }
@@ -135,7 +135,7 @@ fn tell_failure(request: &KeyRequest, failures: u32, why: &str) {
         group,
         endpoint,
         failures,
-        "no keys from the Security Key Service: {why}; asking again, and the keys there are stay in use"
+        "cannot get keys from the Security Key Service: {why}; trying again, and the previous keys stay in use"
     );
 }
 
@@ -149,7 +149,7 @@ fn rest(delivery: &KeyDelivery) -> Duration {
 fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
     if fetched.policy_uri != policy.uri() {
         return Err(format!(
-            "its keys are for {:.80}, and the mapping has {}",
+            "its keys are for the policy {:.80}, but the mapping has {}",
             fetched.policy_uri,
             policy.uri()
         ));
@@ -158,7 +158,7 @@ fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, Str
     let keys: Result<Vec<Keys>, _> = keys.map(|data| Keys::from_bytes(policy, data)).collect();
     let keys = keys.map_err(|error| error.to_string())?;
     if keys.is_empty() || fetched.first_token_id == 0 {
-        return Err("it has no keys of the group".to_owned());
+        return Err("the service has no keys of the group".to_owned());
     }
     Ok(KeyDelivery {
         first_token_id: fetched.first_token_id,

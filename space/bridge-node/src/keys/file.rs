@@ -71,25 +71,28 @@ fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
     let written: Vec<Written> = written.map_err(|error| {
         // The content of the file is not shown.
         format!(
-            "line {}: no list of keys as `ua-space keys` writes it",
+            "line {}: not a list of keys as `ua-space keys` writes it",
             error.line()
         )
     })?;
     let first = written.first().map(|key| key.security_token_id);
-    let first = first.ok_or("there is no key in it")?;
+    let first = first.ok_or("it contains no key")?;
     let mut keys = Vec::new();
     for (at, key) in (0_u32..).zip(&written) {
         let expected = first.checked_add(at);
         if expected != Some(key.security_token_id) {
             return Err(format!(
-                "key {at}: its securityTokenId is {}; they ascend by one",
+                "key {at}: its securityTokenId is {}, but the ids must ascend by 1",
                 key.security_token_id
             ));
         }
         keys.push(key.keys(policy).map_err(|why| format!("key {at}: {why}"))?);
     }
     if keys.len() > MOST_KEYS {
-        return Err(format!("{} keys; at most {MOST_KEYS}", keys.len()));
+        return Err(format!(
+            "{} keys; at most {MOST_KEYS} are allowed",
+            keys.len()
+        ));
     }
     Ok(KeyDelivery {
         first_token_id: first,
@@ -102,11 +105,11 @@ fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
 impl Written {
     fn keys(&self, policy: SecurityPolicy) -> Result<Keys, String> {
         if self.security_token_id == 0 {
-            return Err("0 is no securityTokenId".to_owned());
+            return Err("0 is not a valid securityTokenId".to_owned());
         }
         if SecurityPolicy::from_uri(&self.policy) != Some(policy) {
             return Err(format!(
-                "its policy is not {}, which the group has in the mapping",
+                "its policy differs from {}, the policy of the group in the mapping",
                 policy.uri()
             ));
         }
@@ -197,8 +200,8 @@ mod tests {
         for (text, told) in [
             ("[]".to_owned(), "no key"),
             ("{\"policy\": 1}".to_owned(), "line 1"),
-            (key(1, "Aes256", &good), "its policy is not"),
-            (key(0, "Aes128", &good), "0 is no securityTokenId"),
+            (key(1, "Aes256", &good), "its policy differs from"),
+            (key(0, "Aes128", &good), "0 is not a valid securityTokenId"),
             (key(1, "Aes128", "0a0a"), "22 bytes of key data"),
             (
                 key(1, "Aes128", &"xy".repeat(32)),
@@ -206,7 +209,7 @@ mod tests {
             ),
             (
                 format!("[{}, {}]", key(1, "Aes128", &good), key(3, "Aes128", &good)),
-                "they ascend by one",
+                "the ids must ascend by 1",
             ),
         ] {
             let why = parse(&text, policy).unwrap_err();

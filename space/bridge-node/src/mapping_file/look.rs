@@ -114,7 +114,8 @@ impl Look {
             Ok(looked) => looked,
             Err(_) => {
                 warn!(
-                    "the files of the mapping have not been read within {} s: what runs stays as it is until they are",
+                    "cannot read the files of the mapping within {} s: the running mapping stays in use \
+                     until they are read",
                     SLOW.as_secs()
                 );
                 looking.await

@@ -43,7 +43,8 @@ pub fn call_type(
             names.join(", ")
         };
         format!(
-            "its executor names no service type, and no type of std_srvs has its fields: request ({}), response ({})",
+            "its executor announces no service type, and no type of std_srvs has its fields: request ({}), \
+             response ({})",
             of(&call.request),
             of(&call.response)
         )
@@ -62,7 +63,7 @@ pub fn action_type(
     find: impl FnOnce(&TypeName) -> Result<Arc<ActionCalls>, String>,
 ) -> Result<Arc<ActionCalls>, String> {
     let name = mapped.cloned().or_else(|| named(call));
-    let name = name.ok_or("its executor names no action type")?;
+    let name = name.ok_or("its executor announces no action type")?;
     let calls = find(&name)?;
     call.fits(calls.goal(), map)?;
     Ok(calls)

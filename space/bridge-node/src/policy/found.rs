@@ -48,7 +48,7 @@ impl Policy {
     /// Logs once that a topic would become a value that another topic already is.
     pub fn tell_same(&mut self, ros_topic: &str, topic: TopicId, other: &str) {
         self.told.once(ros_topic, "pattern", || {
-            format!("it would be {topic}, which {other} is already: it does not cross")
+            format!("ignored this topic: it would be {topic}, which {other} already is")
         });
     }
 }

@@ -115,7 +115,9 @@ impl Policy {
         let selection = described.selection(message_type);
         if selection.is_none() {
             self.told.once(&topic.to_string(), "other fields", || {
-                format!("its writer says it is {name}, which has other fields here")
+                format!(
+                    "its writer announces the type {name}, but the definition here has other fields"
+                )
             });
         }
         Some((name.clone(), selection?))

@@ -46,7 +46,7 @@ impl Policy {
                     values.push((variable.topic, binding.selection.clone()));
                 }
                 Err(error) => {
-                    tracing::warn!(topic = %variable.topic, "the value cannot be read: {error}");
+                    tracing::warn!(topic = %variable.topic, "cannot read the value: {error}");
                 }
             }
         }

@@ -23,7 +23,7 @@ impl Told {
         warn!(topic, "{}", message());
         if self.0.len() == MAX_TOLD {
             warn!(
-                "so many peculiarities were told that no further ones are, until the mapping is read again"
+                "too many different warnings about topics: further ones are not logged until the mapping is reloaded"
             );
         }
         true

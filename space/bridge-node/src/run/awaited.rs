@@ -48,7 +48,8 @@ fn add_spaces(
         missing.add(format!("the mapping of space {own}"), || {
             let declared: Vec<String> = mapping.spaces().iter().map(|of| of.id.to_string()).collect();
             format!(
-                "the mapping declares {} only, so just topics named ua_... cross; add `- {{id: {own}}}` to its `spaces`",
+                "the mapping declares only {}, so only topics named ua_... are bridged; add `- {{id: \
+                 {own}}}` to its `spaces`",
                 declared.join(", ")
             )
         });
@@ -72,9 +73,13 @@ fn add_spaces(
         };
         let reason = || match *space == SpaceId::UA {
             true => {
-                format!("{reason}: is ua-server or the component running, and on this network?")
+                format!(
+                    "{reason}: check that ua-server or the component runs and uses this network"
+                )
             }
-            false => format!("{reason}: is the bridge of the space running, and on this network?"),
+            false => {
+                format!("{reason}: check that the bridge of the space runs and uses this network")
+            }
         };
         missing.add(format!("space {space}"), reason);
     }
@@ -229,7 +234,7 @@ calls:
         let router = router(space2);
         assert_eq!(missing(&router, space2, now().monotonic), [""; 0]);
         let space3 = SpaceId::new(3).unwrap();
-        let undeclared = "the mapping of space 3: the mapping declares 1, 2 only, so just topics named ua_... cross; add `- {id";
+        let undeclared = "the mapping of space 3: the mapping declares only 1, 2, so only topics named ua_... are bridged; add `- {id";
         assert_eq!(missing(&router, space3, now().monotonic), [undeclared]);
     }
 }

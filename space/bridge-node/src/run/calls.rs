@@ -21,7 +21,7 @@ impl<P: Port> Shell<P> {
     /// itself.
     #[expect(
         clippy::wildcard_enum_match_arm,
-        reason = "all others are taken in by who hands these on"
+        reason = "the caller handles all other outputs"
     )]
     pub(super) fn call_event(&mut self, event: PortEvent) {
         if self.router.redundancy().is_some() {
@@ -111,14 +111,16 @@ impl<P: Port> Shell<P> {
             Ok(()) => {
                 info!(%topic, %service_type, name = offered.name, "executing the calls of the space with this service")
             }
-            Err(why) => warn!(%topic, %service_type, "not executed for the space: {why}"),
+            Err(why) => {
+                warn!(%topic, %service_type, "not executing the calls of the space with this service: {why}")
+            }
         }
     }
 
     /// Carries out the outputs of the Router that concern calls and namespaces.
     #[expect(
         clippy::wildcard_enum_match_arm,
-        reason = "all others are carried out by who hands these on"
+        reason = "the caller handles all other outputs"
     )]
     pub(super) fn call_output(&mut self, output: Output) {
         match output {
@@ -131,7 +133,7 @@ impl<P: Port> Shell<P> {
             Output::Execute(execution) => self.execute(execution),
             Output::Abandoned { execution, topic } => self.port.abandoned(execution, topic),
             Output::Taken { namespace, by } => self.taken(namespace, by),
-            other => debug!(?other, "an output this program does not know"),
+            other => debug!(?other, "ignored an unknown output"),
         }
     }
 
@@ -188,8 +190,8 @@ impl<P: Port> Shell<P> {
         match by {
             Some(by) => {
                 let why = format!(
-                    "namespace {namespace} of space {} is in use from {by}: nothing is published in it; give this \
-                     program another number, or end the other one",
+                    "namespace {namespace} of space {} is in use from {by}: this program publishes nothing \
+                     in it; give this program another namespace, or stop the other program",
                     self.own
                 );
                 warn!("{why}");

@@ -154,7 +154,7 @@ impl<C: ServiceCall> Caller<C> {
             self.failing = true;
             if insist && may_pass {
                 next = Next::Again;
-                return format!("{text}; trying again");
+                return format!("{text}: trying again");
             }
             text
         });

@@ -28,7 +28,7 @@ pub fn variant_bytes(json: &FieldValue) -> Result<Vec<u8>, WrongValue> {
         || json.server_timestamp.is_some()
         || json.server_picoseconds.is_some();
     if quality {
-        let what = "a Variant has neither Status nor timestamps, a DataValue has";
+        let what = "Status and timestamps belong to a DataValue, not to a Variant";
         return Err(WrongValue::new(what));
     }
     let mut out = Vec::new();
@@ -95,9 +95,9 @@ fn write_variant(json: &FieldValue, out: &mut Vec<u8>) -> Written {
             out.push(0);
             return Ok(());
         }
-        None | Some(0) => return Err(WrongValue::new("a Value wants its UaType")),
+        None | Some(0) => return Err(WrongValue::new("a Value needs its UaType")),
         Some(id) => BuiltinType::from_id(id)
-            .ok_or_else(|| WrongValue::new(format!("UaType {id}: 0 to 25 are known")))?,
+            .ok_or_else(|| WrongValue::new(format!("unknown UaType {id}: expected 0 to 25")))?,
     };
     if let Some(elements) = value.as_array() {
         return write_array(builtin, elements, json, out);
@@ -200,7 +200,7 @@ fn write_extension_object(json: &Value, out: &mut Vec<u8>) -> Written {
         check_keys(object, &["UaTypeId", "UaEncoding", "UaBody"])?;
         let encoding = object.get("UaEncoding").unwrap_or(&Value::Null);
         let encoding = integer(BuiltinType::Byte, encoding).map_err(|wrong| {
-            let hint = "a structure that is not known wants UaEncoding and UaBody";
+            let hint = "an unknown structure needs UaEncoding and UaBody";
             WrongValue::new(format!("{hint}: {}", wrong.what))
         })?;
         ("UaTypeId", encoding, "UaBody")
@@ -212,7 +212,7 @@ fn write_extension_object(json: &Value, out: &mut Vec<u8>) -> Written {
     )?;
     let plain = node_id
         .node_id()
-        .ok_or_else(|| WrongValue::new("a plain NodeId is wanted"))?;
+        .ok_or_else(|| WrongValue::new("expected a plain NodeId"))?;
     write_body(
         plain,
         encoding,
@@ -234,7 +234,7 @@ fn write_body(type_id: NodeId<'_>, encoding: u8, body: &Value, out: &mut Vec<u8>
         }
         (2, Value::String(text)) => ExtensionBody::Xml(text),
         (0..=2, other) => return Err(WrongValue::expected("the body as text", other)),
-        _ => return Err(WrongValue::new("UaEncoding is 0, 1 or 2")),
+        _ => return Err(WrongValue::new("expected UaEncoding 0, 1 or 2")),
     };
     append(
         out,
@@ -385,7 +385,7 @@ fn status_code(json: &Value) -> Result<StatusCode, WrongValue> {
 
 /// Parses `7:Speed`, a name without a number for namespace 0, or an object.
 fn qualified_name(json: &Value) -> Result<QualifiedName<'_>, WrongValue> {
-    let wrong = || WrongValue::expected("a QualifiedName like \"7:Speed\"", json);
+    let wrong = || WrongValue::expected("a QualifiedName such as \"7:Speed\"", json);
     if let Some(text) = json.as_str() {
         let numbered = text.split_once(':').filter(|(namespace, _)| {
             !namespace.is_empty() && namespace.bytes().all(|byte| byte.is_ascii_digit())

@@ -130,7 +130,7 @@ impl Router {
         self.announcements.plan_call(topic, now);
         if let Some(error) = fault {
             self.count_call(topic, None, Reason::MetaData, || {
-                format!("what call {writer_id} takes and gives cannot be announced: {error}")
+                format!("cannot announce the arguments of call {writer_id}: {error}")
             });
         }
     }
@@ -249,7 +249,7 @@ impl Router {
                 let _told = calls.responder.finish(id, lost, since).is_ok();
                 let cause = (Reason::CallRefused, "earlier life");
                 self.count_call(topic, Some(from), cause, || {
-                    "what was asked of this program before it was started anew is not executed"
+                    "not executed: the request was sent before this program was restarted"
                         .to_owned()
                 });
             }
@@ -268,7 +268,7 @@ impl Router {
             Ok(Requested::Refused(..)) => {
                 let cause = (Reason::CallRefused, "busy");
                 self.count_call(topic, Some(from), cause, || {
-                    "as many requests as can be are executed already".to_owned()
+                    "the limit of simultaneous executions is reached".to_owned()
                 });
             }
             Ok(Requested::Abandoned(execution)) => {
@@ -428,7 +428,7 @@ impl Router {
                 self.count_call(topic, None, Reason::NotAsked, String::new);
             }
             Err(FinishRefusal::TooBig) => self.count_call(topic, None, Reason::TooBig, || {
-                "a response that does not fit a datagram".to_owned()
+                "the response does not fit into a datagram".to_owned()
             }),
             Err(why) => {
                 let cause = (Reason::CallRefused, "response");
@@ -485,16 +485,20 @@ fn may_be_executed<'a>(
     known: bool,
 ) -> Result<Executable<'a>, (Refusal, &'static str, String)> {
     let Some(own) = own else {
-        let detail = "it is no call of this program".to_owned();
+        let detail = "this program does not execute the call".to_owned();
         return Err((Refusal::NoSuchAction, "unknown", detail));
     };
     if !own.open && !known {
-        let detail = format!("{from} is another host, and calls are not open to others");
+        let detail = format!(
+            "{from} is another host, and the calls are not open to other hosts (`open: true`)"
+        );
         return Err((Refusal::NotAllowed, "not allowed", detail));
     }
     let wanted = request.action.response_address.unwrap_or_default();
     if !is_answered_at(wanted, (from, group)) {
-        let detail = format!("{from} wants the answer at {wanted:?}, and answers go to {group}");
+        let detail = format!(
+            "{from} requests the response at {wanted:?}, but responses are sent to {group}"
+        );
         return Err((Refusal::NotAllowed, "response address", detail));
     }
     let fields = request.fields.variants();

@@ -185,7 +185,7 @@ impl Router {
             self.announcements.probe(topic, now);
             let cause = (Reason::MetaData, "sender");
             return self.count_call(topic, Some(from), cause, || {
-                "another program than the one that executes the calls of its namespace says what it is"
+                "its description comes from a program that does not execute the calls of its namespace"
                     .to_owned()
             });
         }
@@ -235,13 +235,13 @@ impl Router {
             self.announcements.probe(topic, now);
             let cause = (Reason::MetaData, "too often");
             return self.count_call(topic, Some(from), cause, || {
-                "its program says too often that it is something else".to_owned()
+                "its program changes its description too often".to_owned()
             });
         }
         if !same && !calls.has_room(weight) {
             let cause = (Reason::MetaData, "no room");
             return self.count_call(topic, Some(from), cause, || {
-                "there is no room for what more calls are".to_owned()
+                "the limit of described calls is reached".to_owned()
             });
         }
         let group = calls.groups.entry((topic.space, namespace));
