@@ -89,8 +89,8 @@ impl ActionGraph for Ros1Graph<'_> {
 
 fn unknown(definitions: &mut Definitions, name: &TypeName, error: &DefinitionError) -> String {
     let wanted = format!(
-        "the connections of an action do not bring the definition of its goal, so a folder below \
-         ROS_PACKAGE_PATH must have {}/action/{}.action",
+        "action connections do not carry the definition of the goal: a folder below ROS_PACKAGE_PATH must \
+         contain {}/action/{}.action",
         name.package(),
         name.name()
     );
@@ -207,7 +207,7 @@ impl ActionClient for Sender {
     async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, CallFault> {
         let unheard = || CallFault {
             text: format!(
-                "nobody takes requests to cancel goals of {}",
+                "no node subscribes to requests to cancel goals of {}",
                 self.client.name()
             ),
             may_pass: true,
@@ -345,7 +345,8 @@ impl Sent {
             Heard::FeedbackDropped(count) => {
                 warn!(
                     action = self.client.name(),
-                    count, "feedback came faster than it was taken: the oldest is dropped"
+                    count,
+                    "dropped the oldest feedback: it arrived faster than the other space could receive it"
                 );
             }
             Heard::Done(result) => self.done(result),
@@ -394,7 +395,7 @@ impl Sent {
             Status::Aborted => ABORTED,
             Status::Rejected if self.accepted => ABORTED,
             Status::Recalled => {
-                let why = said("the goal was cancelled before its server worked on it");
+                let why = said("the goal was cancelled before its server started it");
                 self.events.push_back(GoalEvent::Rejected(why));
                 return;
             }
@@ -409,7 +410,7 @@ impl Sent {
             | Status::Recalling
             | Status::Lost => {
                 let text = format!(
-                    "the server of {} sent a result of a goal that has not ended",
+                    "the server of {} sent a result for a goal that has not ended",
                     self.client.name()
                 );
                 self.lose(text, Ran::Perhaps);
@@ -476,7 +477,10 @@ impl NewGoal for New {
     }
 
     async fn accept(mut self) -> Result<Served, String> {
-        let goal = self.goal.take().ok_or("it was decided about already")?;
+        let goal = self
+            .goal
+            .take()
+            .ok_or("the goal was already accepted or rejected")?;
         goal.accept("").map_err(|error| error.to_string())?;
         Ok(Served {
             goal,
@@ -494,7 +498,7 @@ impl NewGoal for New {
 impl Drop for New {
     fn drop(&mut self) {
         if let Some(goal) = self.goal.take() {
-            reject(&goal, "nobody decided about the goal");
+            reject(&goal, "the goal was neither accepted nor rejected in time");
         }
     }
 }

@@ -182,12 +182,14 @@ pub(crate) enum Unusable {
     #[error(transparent)]
     Definition(#[from] DefinitionError),
     #[error(
-        "{} MiB of definitions of other publishers are in use, which is all there is room for; a mapping that names the \
-         topic has room for it in any case",
+        "the limit of {} MiB for definitions of unmapped publishers is reached; add the topic to the \
+         mapping to exempt it from the limit",
         MAX_BYTES >> 20
     )]
     Full,
-    #[error("{name} has checksum {theirs} there and {ours} by its definition")]
+    #[error(
+        "the publisher announces the MD5 sum {theirs} for {name}, but the definition that it sends has {ours}"
+    )]
     Checksum {
         name: TypeName,
         theirs: String,

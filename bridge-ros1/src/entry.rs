@@ -36,9 +36,9 @@ struct BridgeRos1 {
 
 /// Carries topics between a ROS 1 graph and the space of OPC UA PubSub.
 ///
-/// The ROS master is found by ROS_MASTER_URI, and this node by ROS_HOSTNAME or ROS_IP. Remappings
-/// such as `from:=to` and `__name:=bridge` and private parameters such as `_rate:=5` are taken as
-/// every ROS node does.
+/// The ROS master is found by ROS_MASTER_URI, and this node by ROS_HOSTNAME or ROS_IP. Like every
+/// ROS node, the bridge accepts remappings such as `from:=to` and `__name:=bridge`, and private
+/// parameters such as `_rate:=5`.
 #[derive(Debug, Parser)]
 #[command(name = "bridge-ros1", version = build_info::version())]
 struct Flags {

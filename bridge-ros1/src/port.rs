@@ -289,7 +289,8 @@ impl Ros1Port {
         if let Some(ros_topic) = ros_topic {
             self.policy.told.once(&ros_topic, "too many latched", || {
                 format!(
-                    "more than {MAX_LATCHED} latched publishers are connected: the last message of {} does not reach late joiners",
+                    "more than {MAX_LATCHED} latched publishers are connected: late subscribers do not \
+                     receive the last message of {}",
                     peer.caller_id
                 )
             });
@@ -478,7 +479,7 @@ impl Ros1Port {
                 }
                 Err(error) => self.tell_unknown(
                     &ros_topic,
-                    "no value can be written in the type asked for",
+                    "the requested type cannot hold the value",
                     &error,
                 ),
             }
@@ -544,7 +545,7 @@ impl Ros1Port {
         match self.definitions.get(&described.message_type) {
             Ok(message_type) => self.policy.learned(topic, described, &message_type),
             Err(error) => {
-                let said = "its writer says what it is, and that is of no use";
+                let said = "the type that the writer announces cannot be used";
                 self.tell_unknown(&topic.to_string(), said, &error);
                 None
             }
@@ -570,14 +571,15 @@ fn stranger(
     let (theirs, sum) = (theirs.unwrap_or("?"), sum.unwrap_or("none"));
     match (ours, bound) {
         (Some(name), Some(md5)) if name == theirs => format!(
-            "messages of {caller} are dropped: its definition of {theirs} has the MD5 sum {sum}, and the topic crosses with \
-             the definition of MD5 sum {md5}; make both equal"
+            "messages of {caller} are dropped: its definition of {theirs} has the MD5 sum {sum}, but the \
+             topic uses the definition with the MD5 sum {md5}; build both sides from the same definition"
         ),
         (Some(name), _) if name == theirs => format!(
-            "messages of {caller} are dropped: its definition of {theirs} (MD5 sum {sum}) is not that of the topic"
+            "messages of {caller} are dropped: its definition of {theirs} (MD5 sum {sum}) differs from the \
+             definition of the topic"
         ),
         (ours, _) => format!(
-            "messages of {caller} are dropped: it publishes {theirs} and the topic crosses as {}",
+            "messages of {caller} are dropped: it publishes {theirs}, but the topic uses {}",
             ours.unwrap_or("another type"),
         ),
     }
@@ -599,7 +601,8 @@ impl Port for Ros1Port {
                     Seen::Graph(graph) => self.look(graph),
                     Seen::Ended(reason) => {
                         let name = self.node.name();
-                        return PortEvent::Ended(format!("the ROS 1 node {name} was told to shut down: {reason}"));
+                        return PortEvent::Ended(format!("the ROS master or another node shut down the ROS 1 node \
+                                                         {name}: {reason}"));
                     }
                 },
                 outcome = self.services.recv() => {
@@ -822,7 +825,7 @@ impl Port for Ros1Port {
     }
 
     fn hindrance(&self) -> Option<String> {
-        (!self.has_master).then(|| format!("no ROS master answers at {}", self.master))
+        (!self.has_master).then(|| format!("no ROS master responds at {}", self.master))
     }
 
     fn add_awaited(&self, missing: &mut AwaitedPeers) {
@@ -884,12 +887,12 @@ mod tests {
         assert!(told.contains("aaaa") && told.contains("bbbb"), "{told}");
         let told = stranger("/arm", theirs, (Some("arm_msgs/Joint"), None));
         assert!(
-            told.contains("aaaa") && told.contains("is not that of the topic"),
+            told.contains("aaaa") && told.contains("differs from the definition of the topic"),
             "{told}"
         );
         let told = stranger("/arm", theirs, (Some("arm_msgs/Other"), Some("bbbb")));
         assert!(
-            told.ends_with("it publishes arm_msgs/Joint and the topic crosses as arm_msgs/Other"),
+            told.ends_with("it publishes arm_msgs/Joint, but the topic uses arm_msgs/Other"),
             "{told}"
         );
     }

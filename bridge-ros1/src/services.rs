@@ -31,8 +31,8 @@ impl ServiceGraph for Ros1Graph<'_> {
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
         self.definitions.service(name).map_err(|error| {
             let wanted = format!(
-                "the connection to a service does not bring its definition, so a folder below \
-                 ROS_PACKAGE_PATH must have {}/srv/{}.srv",
+                "service connections do not carry the definition: a folder below ROS_PACKAGE_PATH must \
+                 contain {}/srv/{}.srv",
                 name.package(),
                 name.name()
             );

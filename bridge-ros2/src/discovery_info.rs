@@ -65,7 +65,7 @@ impl GidLength {
 
 /// The sample is not a `ParticipantEntitiesInfo` of either length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-#[error("no list of nodes, neither with 16 nor with 24 bytes in a Gid")]
+#[error("not a list of nodes with Gids of 16 or 24 bytes")]
 pub struct NoDiscoveryInfo;
 
 impl ParticipantEntitiesInfo {

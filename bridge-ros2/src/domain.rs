@@ -101,7 +101,7 @@ impl DiscoveryRange {
 #[non_exhaustive]
 pub enum DomainError {
     /// Not a domain id (RTPS 2.5, 9.6.2.3: the ports of a higher domain would not fit).
-    #[error("there is no DDS domain {0}: domains are 0 to 232")]
+    #[error("the DDS domain {0} does not exist: domains are 0 to 232")]
     Domain(u16),
     /// A node name that is invalid in ROS.
     #[error("`{name}` is not a ROS node name: {why}")]
@@ -118,7 +118,8 @@ pub enum DomainError {
     DiscoveryRange(String),
     /// Peers were given, but the published RustDDS supports only multicast.
     #[error(
-        "a list of peers needs RustDDS with this project's patches, as `cargo xtask dist` builds it"
+        "this build does not support a list of peers (--ros-peer, ROS_STATIC_PEERS): use a build with the \
+         patched RustDDS, as `cargo xtask dist` makes it"
     )]
     Peers,
     /// RustDDS could not open its sockets or start its threads.
@@ -130,10 +131,10 @@ pub enum DomainError {
         source: CreateError,
     },
     /// The files of the enclave are invalid.
-    #[error("the bridge cannot be secured: {0}")]
+    #[error("cannot set up DDS Security: {0}")]
     Security(#[from] SecurityError),
     /// RustDDS cannot join with these files.
-    #[error("the enclave in {} does not let the bridge into domain {domain}: {why}", .folder.display())]
+    #[error("cannot join domain {domain} with the enclave in {}: {why}", .folder.display())]
     Enclave {
         /// The folder of the files.
         folder: PathBuf,

@@ -116,7 +116,7 @@ impl Driver {
                 match self.event_loop.turn() {
                     Turned::Done => break,
                     Turned::Unfinished => {}
-                    Turned::Ended => return "the participant is gone",
+                    Turned::Ended => return "the participant has left the domain",
                     Turned::Failed(why) => return why,
                 }
                 turns = turns.saturating_add(1);

@@ -45,37 +45,37 @@ struct BridgeRos2 {
     told: TellingArguments,
     #[command(flatten)]
     redundancy: RedundancyArguments,
-    /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the
-    /// mapping's only ROS 2 space
+    /// The DDS domain to join, or several, such as 2,3. Default: the domain of the space, or of the
+    /// only ROS 2 space of the mapping
     #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = domain_number)]
     domain: Vec<Option<u16>>,
-    /// The space of this domain's values, 2 to 232, or one for each domain as 40,41; without it the
-    /// one the mapping gives the domain, or the one of the domain's number
+    /// The space of the values of the domain, 2 to 232, or a space for each domain, such as 40,41.
+    /// Default: the space of the domain in the mapping, or the space with the number of the domain
     #[arg(long, value_name = "N", env = "UA_SPACE", value_delimiter = ',', value_parser = space_number)]
     space: Vec<Option<u16>>,
-    /// The network interface of the ROS 2 side, by name or address; without it what
-    /// `ROS_AUTOMATIC_DISCOVERY_RANGE` and `ROS_LOCALHOST_ONLY` say, else all
+    /// The network interface of the ROS 2 side, by name or address. Default: by
+    /// `ROS_AUTOMATIC_DISCOVERY_RANGE` and `ROS_LOCALHOST_ONLY`, otherwise all interfaces
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_ROS_INTERFACE")]
     ros_interface: Option<String>,
-    /// A host to announce the bridge to by unicast, where multicast does not reach; may be
-    /// repeated. Without it the hosts in `ROS_STATIC_PEERS`, separated by `;`
+    /// A host that multicast does not reach, to which the bridge is announced by unicast; may be
+    /// repeated. Default: the hosts in `ROS_STATIC_PEERS`, separated by `;`
     #[arg(long, value_name = "ADDRESS")]
     ros_peer: Vec<String>,
-    /// The name of the bridge's node
+    /// The name of the ROS node of the bridge
     #[arg(long, value_name = "NAME", default_value = NODE_NAME)]
     node_name: String,
-    /// The namespace of the bridge's node
+    /// The namespace of the ROS node of the bridge
     #[arg(long, value_name = "/NAMESPACE", default_value = "/")]
     node_namespace: String,
-    /// Take the time for what is stamped from /clock
+    /// Use the time of /clock for timestamps
     #[arg(long)]
     use_sim_time: bool,
-    /// How many bytes a Gid has in the node's list of readers and writers: 24 up to ROS 2 Humble,
-    /// 16 from Iron on
+    /// Length of a Gid in bytes in the list of readers and writers of the node: 24 up to ROS 2
+    /// Humble, 16 from Iron on
     #[arg(long, value_name = "16|24|auto", default_value = "auto", value_parser = gid_length)]
     gid: GidChoice,
-    /// Arguments as `ros2 run` has them: -r __node:=NAME, -r __ns:=/NAMESPACE, -p
-    /// use_sim_time:=true, --enclave /NAME; ends with `--`
+    /// Arguments as with `ros2 run`: -r __node:=NAME, -r __ns:=/NAMESPACE, -p use_sim_time:=true,
+    /// --enclave /NAME; ends with `--`
     #[arg(
         long,
         value_name = "ROS_ARGS",
@@ -99,8 +99,8 @@ impl BridgeRos2 {
             .map_err(|error| Failure::new(FailureKind::Configuration, error.to_string()))?;
         if let Security::Refrained(why) = &security {
             warn!(
-                "ROS_SECURITY_ENABLE is true, and the bridge is NOT secured: {why}. With ROS_SECURITY_STRATEGY=Enforce \
-                 it would not start"
+                "ROS_SECURITY_ENABLE is true, but the bridge runs WITHOUT security: {why}. Correct this, or \
+                 set ROS_SECURITY_STRATEGY=Enforce to refuse such a start"
             );
         }
         Ok(security)
@@ -319,14 +319,15 @@ fn choose_spaces(
 ) -> Result<Vec<SpaceId>, String> {
     if !spaces.is_empty() && !domains.is_empty() && spaces.len() != domains.len() {
         return Err(format!(
-            "{} spaces for {} domains: --space and --domain (ROS_DOMAIN_ID) go together, one space for each domain",
+            "{} spaces for {} domains: give --space and --domain (ROS_DOMAIN_ID) the same number of values, \
+             a space for each domain",
             spaces.len(),
             domains.len()
         ));
     }
     for (what, numbers) in [("domain", domains), ("space", spaces)] {
         if let Some(twice) = repeated(numbers) {
-            return Err(format!("{what} {twice} is asked for twice"));
+            return Err(format!("{what} {twice} is given twice"));
         }
     }
     let count = spaces.len().max(domains.len()).max(1);
@@ -340,7 +341,9 @@ fn choose_spaces(
         })
         .collect::<Result<_, _>>()?;
     match repeated(&chosen) {
-        Some(twice) => Err(format!("two of the domains are of space {twice}")),
+        Some(twice) => Err(format!(
+            "two of the domains belong to space {twice}; give each domain its own space"
+        )),
         None => Ok(chosen),
     }
 }
@@ -363,12 +366,12 @@ fn choose_space(
     if let Some(space) = space {
         let id = SpaceId::new(space)
             .filter(|id| id.is_ros2())
-            .ok_or_else(|| format!("--space {space}: a ROS 2 space is 2 to 232"))?;
+            .ok_or_else(|| format!("--space {space}: ROS 2 spaces are 2 to 232"))?;
         let declared = mapping.space(id).and_then(|space| space.domain);
         return match (domain, declared) {
             (Some(asked), Some(declared)) if asked != declared => Err(format!(
-                "space {id} is DDS domain {declared} in the mapping, but domain {asked} is asked for \
-                 (--domain or ROS_DOMAIN_ID)"
+                "space {id} is DDS domain {declared} in the mapping, but --domain or ROS_DOMAIN_ID says \
+                 {asked}; make both equal"
             )),
             _ => Ok(id),
         };
@@ -379,8 +382,8 @@ fn choose_space(
             let free = free.filter(|id| mapping.space(*id).is_none()).min();
             let id = free.map_or(FIRST_FREE, u16::from);
             format!(
-                "DDS domain {domain} has no space: add `- {{id: {id}, domain: {domain}}}` to `spaces` of the mapping, or say \
-                 --space N, 2 to 232"
+                "DDS domain {domain} has no space: add `- {{id: {id}, domain: {domain}}}` to `spaces` of \
+                 the mapping, or give --space N (2 to 232)"
             )
         });
     }
@@ -392,12 +395,12 @@ fn choose_space(
     match (declared.next(), declared.next()) {
         (Some(only), None) => Ok(only),
         (Some(_), Some(_)) => Err(
-            "the mapping has several ROS 2 spaces: say which with --space N, or --space N,M for several in one program"
+            "the mapping has several ROS 2 spaces: choose with --space N, or --space N,M for several in one program"
                 .to_owned(),
         ),
         (None, _) => Err(
-            "which DDS domain? Add `- {id: 2}` to `spaces` of the mapping (space 2 in DDS domain 2; `- {id: 2, domain: 0}` \
-             for domain 0), or say --domain N (or set ROS_DOMAIN_ID)"
+            "the DDS domain is not given: add `- {id: 2}` to `spaces` of the mapping (space 2 in DDS domain \
+             2; `- {id: 2, domain: 0}` for domain 0), or give --domain N (or set ROS_DOMAIN_ID)"
                 .to_owned(),
         ),
     }
@@ -412,7 +415,7 @@ fn gid_length(text: &str) -> Result<GidChoice, &'static str> {
         "16" => Ok(GidChoice(Some(GidLength::Bytes16))),
         "24" => Ok(GidChoice(Some(GidLength::Bytes24))),
         "auto" => Ok(GidChoice(None)),
-        _ => Err("16, 24 or auto expected"),
+        _ => Err("expected 16, 24 or auto"),
     }
 }
 
@@ -468,8 +471,8 @@ mod tests {
         assert_eq!(numbers(both.unwrap()), [40, 41]);
         for (spaces, domains, why) in [
             (&[40][..], &[0, 1][..], "1 spaces for 2 domains"),
-            (&[], &[7, 7], "domain 7 is asked for twice"),
-            (&[40, 40], &[], "space 40 is asked for twice"),
+            (&[], &[7, 7], "domain 7 is given twice"),
+            (&[40, 40], &[], "space 40 is given twice"),
         ] {
             let error = choose_spaces(spaces, domains, &none).unwrap_err();
             assert!(error.contains(why), "{error}");

@@ -12,15 +12,16 @@ pub fn ignored(variable: impl Fn(&str) -> Option<String>) -> Vec<String> {
     let mut warnings = Vec::new();
     if let Some(servers) = set("ROS_DISCOVERY_SERVER").filter(|list| list.contains(|c| c != ';')) {
         warnings.push(format!(
-            "ROS_DISCOVERY_SERVER is `{servers}`, and the bridge is no client of a discovery server: nodes that use the \
-             server alone are not seen. Unset it on the robot, or run the bridge where multicast reaches the nodes; \
-             ROS_STATIC_PEERS lists hosts that multicast does not reach"
+            "ROS_DISCOVERY_SERVER is `{servers}`, but the bridge does not support discovery servers: it \
+             does not discover nodes that use only the server. Unset the variable on the robot, or run the \
+             bridge where multicast reaches the nodes; list hosts that multicast does not reach in \
+             ROS_STATIC_PEERS"
         ));
     }
     if let Some(rmw) = set("RMW_IMPLEMENTATION").filter(|rmw| !KNOWN_RMW.contains(&rmw.as_str())) {
         let consequence = match rmw.contains("zenoh") {
-            true => "nodes that use it are not seen",
-            false => "the bridge is not tested beside it",
+            true => "the bridge does not discover nodes that use it",
+            false => "the bridge is not tested with it",
         };
         warnings.push(format!(
             "RMW_IMPLEMENTATION is `{rmw}`, and the bridge speaks DDS as Fast DDS and Cyclone DDS do: {consequence}. Run \
@@ -30,8 +31,8 @@ pub fn ignored(variable: impl Fn(&str) -> Option<String>) -> Vec<String> {
     for name in PROFILES {
         if let Some(file) = set(name) {
             warnings.push(format!(
-                "{name} is `{file}`, and the bridge does not read profiles: choose its network interface with \
-                 --ros-interface, and hosts that multicast does not reach with ROS_STATIC_PEERS"
+                "{name} is `{file}`, but the bridge does not read profiles: choose its network interface \
+                 with --ros-interface, and list hosts that multicast does not reach in ROS_STATIC_PEERS"
             ));
         }
     }

@@ -59,11 +59,11 @@ impl NodeOptions {
         };
         let parts = self.namespace.strip_prefix('/');
         if !is_token(&self.name) {
-            Some("a name is letters, digits and `_`, no digit first")
+            Some("a name has letters, digits and `_`, and does not begin with a digit")
         } else if !parts.is_some_and(|parts| parts.is_empty() || parts.split('/').all(is_token)) {
-            Some("a namespace is `/`, or names each after a `/`")
+            Some("a namespace is `/`, or names with a `/` before each")
         } else if self.name.len() > 255 || self.namespace.len() > 245 {
-            Some("a name has up to 255 letters, a namespace up to 245")
+            Some("a name has up to 255 characters, a namespace up to 245")
         } else {
             None
         }

@@ -445,7 +445,7 @@ impl Ros2Port {
                     .iter()
                     .any(|r| r.type_name == dds_type && r.type_hash.is_some())
                 {
-                    let said = "its writer says what it is, and that is of no use";
+                    let said = "the type that the writer announces cannot be used";
                     self.tell_unknown_type(&topic.to_string(), said, &error);
                 }
                 None
@@ -508,7 +508,7 @@ impl Port for Ros2Port {
         }
         if self.is_at_home(topic.space) {
             // Subscribers of this domain receive from the node that produces the value.
-            return Err("at home in this domain");
+            return Err("served by another bridge of this domain");
         }
         let Some(Sink {
             open: Some(open),
@@ -543,8 +543,8 @@ impl Port for Ros2Port {
             let dds_topic = dds_topic.clone();
             self.policy.told.once(&dds_topic, "too large", || {
                 format!(
-                    "a message of {size} bytes is not sent: above {limit} bytes it might never be complete at a \
-                     subscriber of this topic ({})",
+                    "a message of {size} bytes is not sent: subscribers of this topic may not be able to \
+                     reassemble more than {limit} bytes ({})",
                     limits::RUSTDDS
                 )
             });

@@ -1,5 +1,6 @@
 //! The QoS that the bridge's endpoints request and offer.
 
+use std::fmt;
 use std::num::NonZeroU16;
 
 use messages::TypeName;
@@ -69,6 +70,19 @@ impl Requested {
     }
 }
 
+impl fmt::Display for Requested {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self.reliable {
+            true => "reliable",
+            false => "best effort",
+        })?;
+        f.write_str(match self.transient_local {
+            true => ", transient local",
+            false => ", volatile",
+        })
+    }
+}
+
 /// The QoS that a writer offers, and the overflow policy of its bounded queue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Offered {
@@ -78,6 +92,15 @@ pub enum Offered {
     /// Every value counts, up to this number of waiting values: volatile, and the oldest value is
     /// dropped.
     DropOldest(NonZeroU16),
+}
+
+impl fmt::Display for Offered {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::KeepLatest => f.write_str("reliable, transient local, keep latest"),
+            Self::DropOldest(waiting) => write!(f, "reliable, volatile, up to {waiting} waiting"),
+        }
+    }
 }
 
 impl Offered {
@@ -180,6 +203,16 @@ mod tests {
             matches!(qos.reliability(), Some(Reliability::Reliable { .. })),
             qos.durability() == Some(Durability::TransientLocal),
         )
+    }
+
+    #[test]
+    fn logs_show_the_policies_in_the_words_of_ros() {
+        let best_effort = Requested::from_writers(&[writer(false, true)]);
+        assert_eq!(best_effort.to_string(), "best effort, transient local");
+        let reliable = Requested::from_writers(&[writer(true, false)]);
+        assert_eq!(reliable.to_string(), "reliable, volatile");
+        let events = Offered::DropOldest(NonZeroU16::MIN);
+        assert_eq!(events.to_string(), "reliable, volatile, up to 1 waiting");
     }
 
     #[test]

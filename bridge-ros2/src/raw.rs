@@ -79,7 +79,7 @@ impl PayloadError {
     pub fn label(self) -> &'static str {
         match self {
             Self::NoHeader(_) => "shorter than a CDR header",
-            Self::Encoding(_) => "not little endian CDR",
+            Self::Encoding(_) => "not little-endian CDR",
         }
     }
 }

@@ -26,13 +26,13 @@ impl RosArgs {
         let mut words = words.iter().map(AsRef::as_ref);
         while let Some(word) = words.next() {
             let rule = match word {
-                "-r" | "--remap" | "-p" | "--param" => words
-                    .next()
-                    .ok_or_else(|| format!("{word}: a rule as NAME:=VALUE is missing"))?,
+                "-r" | "--remap" | "-p" | "--param" => words.next().ok_or_else(|| {
+                    format!("{word}: expected a rule such as NAME:=VALUE after it")
+                })?,
                 "-e" | "--enclave" => {
-                    let name = words
-                        .next()
-                        .ok_or_else(|| format!("{word}: the name of an enclave is missing"))?;
+                    let name = words.next().ok_or_else(|| {
+                        format!("{word}: expected the name of an enclave after it")
+                    })?;
                     found.enclave = Some(name.to_owned());
                     continue;
                 }
@@ -40,13 +40,13 @@ impl RosArgs {
                 "--" => break,
                 other => {
                     return Err(format!(
-                        "{other}: a bridge takes -r, -p and --enclave after --ros-args"
+                        "{other}: unknown; a bridge accepts -r, -p and --enclave after --ros-args"
                     ));
                 }
             };
             let (name, value) = rule
                 .split_once(":=")
-                .ok_or_else(|| format!("{word} {rule}: a rule as NAME:=VALUE is expected"))?;
+                .ok_or_else(|| format!("{word} {rule}: expected a rule such as NAME:=VALUE"))?;
             let is_parameter = word == "-p" || word == "--param";
             match (is_parameter, name) {
                 (false, "__node" | "__name") => found.name = Some(value.to_owned()),
@@ -61,12 +61,12 @@ impl RosArgs {
                 }
                 (false, _) => {
                     return Err(format!(
-                        "{word} {rule}: the names of topics are the mapping's; a bridge takes __node and __ns"
+                        "{word} {rule}: a bridge accepts __node and __ns only; the mapping names the topics"
                     ));
                 }
                 (true, _) => {
                     return Err(format!(
-                        "{word} {rule}: the parameter of a bridge is use_sim_time"
+                        "{word} {rule}: use_sim_time is the only parameter of a bridge"
                     ));
                 }
             }
@@ -101,9 +101,9 @@ mod tests {
             ("-r /chatter:=/news", "mapping"),
             ("-p rate:=3", "use_sim_time"),
             ("-p use_sim_time:=soon", "soon"),
-            ("-r", "missing"),
+            ("-r", "NAME:=VALUE"),
             ("-r __node", "NAME:=VALUE"),
-            ("--enclave", "missing"),
+            ("--enclave", "the name of an enclave"),
             ("--params-file x.yaml", "--params-file"),
         ] {
             let words: Vec<&str> = words.split(' ').collect();

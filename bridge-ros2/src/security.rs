@@ -50,13 +50,13 @@ pub enum SecurityError {
     },
     /// Not a name of an enclave.
     #[error(
-        "`{0}` is not the name of an enclave: it is an absolute ROS name as /cell/bridge (--ros-args --enclave, or \
-         ROS_SECURITY_ENCLAVE_OVERRIDE)"
+        "`{0}` is not the name of an enclave: give an absolute ROS name such as /cell/bridge (--ros-args \
+         --enclave, or ROS_SECURITY_ENCLAVE_OVERRIDE)"
     )]
     Name(String),
     /// Security is unavailable, with `Enforce`.
     #[error(
-        "ROS_SECURITY_ENABLE is true and ROS_SECURITY_STRATEGY is Enforce, but the bridge cannot be secured: {0}"
+        "ROS_SECURITY_ENABLE is true and ROS_SECURITY_STRATEGY is Enforce, but DDS Security cannot be set up: {0}"
     )]
     Enforced(String),
     /// A file exists and is invalid.
@@ -156,20 +156,21 @@ impl Enclave {
     fn find(keystore: Option<&str>, name: &str) -> Result<Self, String> {
         if !cfg!(feature = "security") {
             return Err(
-                "this bridge-ros2 is built without DDS Security (`bridge-ros2 --version` names it where it is there; \
-                 cargo feature `security`)"
+                "this bridge-ros2 is built without DDS Security (cargo feature `security`; `bridge-ros2 \
+                 --version` shows it)"
                     .to_owned(),
             );
         }
         let keystore = keystore
-            .ok_or("ROS_SECURITY_KEYSTORE does not say where the keystore is (`ros2 security create_keystore`)")?;
+            .ok_or("ROS_SECURITY_KEYSTORE is not set: set it to the folder of the keystore (`ros2 security \
+                    create_keystore` creates it)")?;
         let folder = Path::new(keystore)
             .join("enclaves")
             .join(name.trim_start_matches('/'));
         if !folder.is_dir() {
             return Err(format!(
-                "there is no folder {} for the enclave {name} (`ros2 security create_enclave {keystore} {name}`; \
-                 --ros-args --enclave names another)",
+                "the folder {} of the enclave {name} does not exist: create it with `ros2 security \
+                 create_enclave {keystore} {name}`, or give another enclave with --ros-args --enclave",
                 folder.display()
             ));
         }
@@ -179,7 +180,7 @@ impl Enclave {
             .collect();
         if !missing.is_empty() {
             return Err(format!(
-                "{} lacks {} (`ros2 security create_enclave {keystore} {name}` makes them)",
+                "{} lacks {}: create the files with `ros2 security create_enclave {keystore} {name}`",
                 folder.display(),
                 missing.join(", ")
             ));

@@ -60,7 +60,7 @@ impl TypeServer {
                 let known = asked.lock().unwrap_or_else(PoisonError::into_inner);
                 answer(&known, &request)
             });
-            async { answer.map_err(|Malformed| "a request cut short".to_owned()) }
+            async { answer.map_err(|Malformed| "a truncated request".to_owned()) }
         };
         let options = ServiceOptions::default();
         let server = ServiceServer::open(domain, peers, &service, options, handler)?;
@@ -122,13 +122,13 @@ pub(crate) fn read_answer(bytes: &[u8]) -> Result<Vec<DescribedType>, String> {
         let successful = reader.bool()?;
         let reason = reader.string()?;
         if !successful {
-            return Ok(Err(format!("it does not tell: {reason}")));
+            return Ok(Err(format!("it does not describe the type: {reason}")));
         }
         let mut types = vec![read_type(&mut reader)?];
         types.extend(reader.sequence(read_type)?);
         Ok(Ok(types))
     };
-    read().unwrap_or_else(|Malformed| Err("its answer is malformed".to_owned()))
+    read().unwrap_or_else(|Malformed| Err("its response is malformed".to_owned()))
 }
 
 fn read_type(reader: &mut CdrReader<'_>) -> Result<DescribedType, Malformed> {
@@ -198,7 +198,7 @@ fn answer(known: &Known, request: &TypeRequest) -> Bytes {
 }
 
 fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Description, String> {
-    let unknown = || format!("type {name} is none of this node");
+    let unknown = || format!("this node does not use the type {name}");
     // For messages the short name suffices.
     let full = name.parse::<TypeName>();
     let full = full.map_or_else(|_| name.to_owned(), |name| name.ros2());
@@ -213,7 +213,7 @@ fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k Descript
         return Err(unknown());
     }
     Err(format!(
-        "type {name} has the hash {} here",
+        "this node uses the type {name} with the hash {}",
         hashes.join(", ")
     ))
 }
@@ -320,7 +320,10 @@ mod tests {
         {
             let request = asked(type_name, type_hash, true);
             let refused = read_answer(&answer(&known, &request)).unwrap_err();
-            assert!(refused.contains("it does not tell: type"), "{refused}");
+            assert!(
+                refused.contains("it does not describe the type: "),
+                "{refused}"
+            );
         }
     }
 

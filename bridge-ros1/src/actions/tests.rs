@@ -304,7 +304,7 @@ async fn goals_of_the_graph_are_decided_about_and_ended_here() {
             (Status::Rejected, "not that".to_owned(), nothing.clone()),
             (
                 Status::Rejected,
-                "nobody decided about the goal".to_owned(),
+                "the goal was neither accepted nor rejected in time".to_owned(),
                 nothing.clone()
             ),
             (Status::Succeeded, "done".to_owned(), vec![6, 0, 0, 0]),

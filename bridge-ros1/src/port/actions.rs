@@ -22,7 +22,8 @@ impl Ros1Port {
             if let Some(node) = other(&action) {
                 self.policy.told.once(&action, "taken", || {
                     format!(
-                        "{topic} is not offered as {action}: the node {node} serves such an action"
+                        "{topic} is not offered as {action}: the node {node} already serves this action; \
+                         use another name, or stop the node"
                     )
                 });
             }

@@ -17,7 +17,8 @@ impl Ros1Port {
         if let Some(address) = self.address.filter(|address| !is_local(*address)) {
             missing.add("other ROS nodes", || {
                 format!(
-                    "this node says it is at {address}, which is no address of this host; correct ROS_IP or ROS_HOSTNAME"
+                    "this node announces the address {address}, which is not an address of this host; \
+                     correct ROS_IP or ROS_HOSTNAME"
                 )
             });
         }
@@ -76,7 +77,8 @@ impl Ros1Port {
             match typed {
                 Some(expected) => format!("{publisher} does not publish it as {expected}"),
                 None => format!(
-                    "its publisher {publisher} is not connected: it cannot be reached, or it has died (rosnode cleanup)"
+                    "its publisher {publisher} is not connected: the node is unreachable, or it has died \
+                     (remove it with `rosnode cleanup`)"
                 ),
             }
         });
@@ -94,7 +96,8 @@ impl Ros1Port {
         if let Some(publisher) = self.others(&self.graph.publishers, topic).next() {
             missing.add(peer, || {
                 format!(
-                    "no node reads it, and {publisher} publishes it too; if the value comes from there, its `origin` is {}",
+                    "no node subscribes to it, and {publisher} publishes it too; if {publisher} produces \
+                     the value, set its `origin` to {}",
                     self.policy.own()
                 )
             });
@@ -113,19 +116,20 @@ impl Ros1Port {
             missing.add(format!("subscriber {node}"), || {
                 if let Some(refused) = publisher.refused_type() {
                     return format!(
-                        "it reads {} as {refused}, which is published as {}",
+                        "it subscribes to {} as {refused}, but the bridge publishes {}",
                         publisher.topic(),
                         open.message_type.name()
                     );
                 }
                 if publisher.asks_for_udp(node) {
                     return format!(
-                        "it asks for {} over UDPROS only; let it use TCPROS",
+                        "it requests {} over UDPROS only; configure it for TCPROS",
                         publisher.topic()
                     );
                 }
                 format!(
-                    "it cannot reach {} (set ROS_IP to an address that it reaches), or it has died (rosnode cleanup)",
+                    "it cannot reach {} (set ROS_IP to an address that it can reach), or it has died \
+                     (remove it with `rosnode cleanup`)",
                     self.node.uri()
                 )
             });

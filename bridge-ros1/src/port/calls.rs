@@ -29,7 +29,8 @@ impl Ros1Port {
             if let Some(node) = other(&service) {
                 self.policy.told.once(&service, "taken", || {
                     format!(
-                        "{topic} is not offered as {service}: the node {node} has such a service"
+                        "{topic} is not offered as {service}: the node {node} already offers this service; \
+                         use another name, or stop the node"
                     )
                 });
             }
@@ -73,7 +74,7 @@ impl Ros1Port {
             .collect();
         for (service, error) in self.kinds.look(&self.node, others.iter()) {
             self.policy.told.once(&service, "type of the service", || {
-                format!("it is not known of which type the service {service} is: {error}")
+                format!("the type of the service {service} is unknown: {error}")
             });
         }
         let present: Present = others
@@ -157,7 +158,7 @@ impl Kinds {
                 let named = header.and_then(|header| {
                     let named = header.get("type").unwrap_or_default();
                     let parsed = named.parse();
-                    parsed.map_err(|_| format!("its server says `{}`", named.escape_debug()))
+                    parsed.map_err(|_| format!("its server reports `{}`", named.escape_debug()))
                 });
                 (service, named)
             });

@@ -172,8 +172,8 @@ impl Ros1Port {
             warn!(
                 topics,
                 limit = MAX_TOPICS,
-                "there is no room for more topics that the mapping does not name: these are left alone; a mapping that \
-                 names them has room for them in any case"
+                "ignored further topics that the mapping does not name: their limit is reached; add the \
+                 topics to the mapping to exempt them from the limit"
             );
             self.refused.told = Some(now);
         }

@@ -26,7 +26,7 @@ impl Ros1Port {
         {
             self.events.push_back(PortEvent::Dropped {
                 reason: Reason::TooManyTopics,
-                why: "values that the mapping does not name and nobody subscribes to",
+                why: "values without an entry in the mapping and without a subscriber",
                 count: 1,
             });
             return false;

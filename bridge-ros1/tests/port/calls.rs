@@ -112,7 +112,7 @@ async fn a_service_goes_with_its_call_after_who_waits_was_told() {
     cell.port.call_gone(id(START));
     let answer = beside(&mut cell, answer).await;
     let fault = answer.unwrap().unwrap_err().to_string();
-    assert!(fault.contains("not known whether"), "{fault}");
+    assert!(fault.contains("unknown whether"), "{fault}");
     let gone = async {
         while !matches!(
             client.call(Bytes::new()).await,

@@ -27,7 +27,7 @@ async fn made_up_values_keep_out_none_of_the_mapping_and_give_way_when_they_fall
         port.wanted(made_up(number), &NO_TYPE, None);
     }
     let refused =
-        "1 too_many_topics values that the mapping does not name and nobody subscribes to";
+        "1 too_many_topics values without an entry in the mapping and without a subscriber";
     assert_eq!(events(port, 4).await, [refused; 4]);
     port.wanted(id("ua_2_2_3"), &BOOLEAN, None);
     let bound = "ua_2_2_3 is std_msgs/Bool whole";

@@ -209,7 +209,7 @@ impl Shared {
             && readers.iter().all(|reader| reader.type_name != *wanted)
         {
             let theirs = &other.type_name;
-            let what = format!("there is one with {theirs}, and {wanted} is wanted");
+            let what = format!("its type is {theirs}, but {wanted} is required");
             return Err(missing(what));
         }
         for client in [&self.asked.send, &self.asked.cancel, &self.asked.result] {
@@ -219,7 +219,7 @@ impl Shared {
         }
         for topic in [self.action.feedback_topic(), self.action.status_topic()] {
             if seen.writers(&topic).is_empty() {
-                return Err(missing(format!("nobody publishes {topic}")));
+                return Err(missing(format!("no node publishes {topic}")));
             }
         }
         Ok(())
@@ -462,7 +462,7 @@ impl Shared {
     fn malformed(&self, state: &mut State, what: &'static str) {
         state.goals.counters.malformed += 1;
         let action = self.action.name();
-        debug!(action, what, "a sample that does not read");
+        debug!(action, what, "dropped a malformed sample");
     }
 }
 

@@ -160,7 +160,8 @@ impl Drop for ActionClient {
         for (goal, age) in state.goals.pending(Instant::now()) {
             warn!(
                 action = self.name(), %goal, ?age,
-                "withdrawn goal is left behind: whether the action server works on it is unknown"
+                "cannot confirm the cancellation of a withdrawn goal: the action server may still execute \
+                 it; check the robot"
             );
         }
         let closed = Outcome::Lost(LostReason::ClientClosed);

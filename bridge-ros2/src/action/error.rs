@@ -14,13 +14,13 @@ pub enum ActionError {
     #[error(transparent)]
     Domain(#[from] DomainError),
     /// The empty result in a server's options is invalid.
-    #[error("the empty result of the action {0} is not CDR in little endian with a status in it")]
+    #[error("the empty result of the action {0} is not little-endian CDR with a status")]
     EmptyResult(String),
 }
 
 /// A goal was not sent, because its client has a goal with the same id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
-#[error("the client has a goal {0} already")]
+#[error("the client already has a goal {0}")]
 pub struct IdInUse(pub GoalId);
 
 /// No server is ready to receive goals.
@@ -42,23 +42,23 @@ pub enum LostReason {
     #[error(transparent)]
     NoServer(#[from] NoServer),
     /// The client has reached its limit of goals. The goal was not sent.
-    #[error("{0} goals of the action are open already")]
+    #[error("the limit of {0} open goals of the action is reached")]
     Busy(usize),
     /// The goal was withdrawn before it was sent.
     #[error("the goal was withdrawn before it was sent")]
     Withdrawn,
     /// The message is not little-endian CDR with its encapsulation header. The goal was not sent.
-    #[error("the goal is not CDR in little endian")]
+    #[error("the goal is not little-endian CDR")]
     Message,
     /// The server did not reply to the goal; [`ServiceError::may_have_run`] returns whether a
     /// server may have accepted it.
-    #[error("the goal was not answered: {0}")]
+    #[error("no response to the goal: {0}")]
     Unanswered(ServiceError),
     /// The goal was accepted, and its server was lost: it died, restarted, or is unreachable.
-    #[error("the server has left: {0}")]
+    #[error("the server has left the domain: {0}")]
     ServerLost(ServiceError),
     /// The goal was accepted, and all servers of the action have been absent for too long.
-    #[error("the server of {action} has left")]
+    #[error("the server of {action} has left the domain")]
     ServerGone {
         /// The ROS name of the action.
         action: String,
@@ -67,7 +67,7 @@ pub enum LostReason {
     #[error("the server does not know the goal")]
     Unknown,
     /// The server's reply could not be decoded.
-    #[error("the server's {0} does not read")]
+    #[error("the {0} of the server is malformed")]
     Malformed(&'static str),
     /// The client was dropped.
     #[error("the action client was closed")]

@@ -39,10 +39,10 @@ pub enum GoalError {
     },
     /// The goal is no longer known: it has ended and its result has expired, or the client of the
     /// cancel request no longer waits.
-    #[error("the goal {0} is forgotten")]
+    #[error("the goal {0} has expired")]
     Forgotten(GoalId),
     /// The message is not little-endian CDR with its encapsulation header.
-    #[error("the message for the goal {0} is not CDR in little endian")]
+    #[error("the message for the goal {0} is not little-endian CDR")]
     Message(GoalId),
     /// The server was dropped.
     #[error("the action server was closed")]

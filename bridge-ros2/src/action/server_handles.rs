@@ -254,7 +254,7 @@ impl Drop for ServerGoal {
             if let Err(error) = self.abort(&empty)
                 && error != GoalError::Closed
             {
-                warn!(action = self.shared.action_name(), %error, "a goal was dropped");
+                warn!(action = self.shared.action_name(), %error, "cannot end an abandoned goal");
             }
         }
     }

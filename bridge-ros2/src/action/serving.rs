@@ -382,10 +382,11 @@ impl Shared {
         let result = match asked {
             Asked::Ended(result) => Ok(result),
             Asked::Unknown => wire::with_status(&self.options.empty_result, Status::Unknown)
-                .ok_or_else(|| "the empty result of the options is no CDR".to_owned()),
+                .ok_or_else(|| "the empty result in the options is not CDR".to_owned()),
             Asked::Waits(displaced) => {
                 drop(displaced);
-                let why = "too many wait for the result of one goal, or the server has gone";
+                let why =
+                    "too many clients wait for the result of this goal, or the server was closed";
                 result.await.map_err(|_| why.to_owned())
             }
         };
@@ -411,7 +412,7 @@ impl Shared {
 
     fn malformed(&self) -> String {
         self.lock().goals.counters.malformed += 1;
-        "a request that does not read".to_owned()
+        "dropped a malformed request".to_owned()
     }
 
     fn publish_status(&self, state: &mut State) {

@@ -78,7 +78,7 @@ impl ParameterServer {
                 ServiceOptions::default(),
                 move |request| {
                     let answer = shared.answer(question, &request.bytes);
-                    async { answer.map_err(|Malformed| "a request cut short".to_owned()) }
+                    async { answer.map_err(|Malformed| "a truncated request".to_owned()) }
                 },
             )?);
         }

@@ -29,8 +29,8 @@ impl ActionGraph for Ros2Graph<'_> {
         let found = self.definitions.action_calls(name);
         found.map_err(|error| {
             let wanted = format!(
-                "discovery does not bring the definition of an action, so a prefix in AMENT_PREFIX_PATH or a \
-                 folder of type_paths must have {}/action/{}.action",
+                "discovery does not carry the definition of an action: a prefix in AMENT_PREFIX_PATH or a \
+                 folder of type_paths must contain {}/action/{}.action",
                 name.package(),
                 name.name()
             );
@@ -156,8 +156,8 @@ impl SentGoal for Goal {
                     continue;
                 }
                 action::GoalEvent::Overdue(limit) => GoalEvent::Overdue(format!(
-                    "the action server has not decided about the goal within {limit:?}; it is cancelled as soon as it \
-                     is accepted"
+                    "the action server has not accepted or rejected the goal within {limit:?}; the bridge \
+                     cancels it as soon as it is accepted"
                 )),
                 action::GoalEvent::CancelRefused => GoalEvent::CancelRefused,
                 action::GoalEvent::Ended(outcome) => ended(outcome),

@@ -22,7 +22,8 @@ impl Ros2Port {
         for (topic, action) in self.actions.chosen(&self.policy) {
             if is_served(&self.graph, &snapshot, &action) {
                 self.policy.told.once(&action, "taken", || {
-                    format!("{topic} is not served as {action}: another node has such an action")
+                    format!("{topic} is not offered as {action}: another node already serves this action; \
+                             use another name, or stop the node")
                 });
                 taken.push(action);
             }

@@ -64,7 +64,7 @@ impl Ros2Port {
             missing.add(format!("topic /{name}"), || {
                 match writers.iter().any(|writer| writer.type_name == dds_type) {
                     true => format!(
-                        "no definition of {} that its publisher has",
+                        "the publisher uses another definition of {}",
                         source.message_type
                     ),
                     false => format!("no publisher of type {}", source.message_type),
@@ -87,7 +87,8 @@ impl Ros2Port {
             missing.add(peer, || {
                 let owner = self.domain.owner(writer.guid);
                 format!(
-                    "no node reads it, and {} publishes it too; if the value comes from there, its `origin` is {}",
+                    "no node subscribes to it, and {} publishes it too; if that node produces the value, \
+                     set its `origin` to {}",
                     owner.as_deref().unwrap_or("an unnamed node"),
                     self.policy.own()
                 )

@@ -29,21 +29,22 @@ impl Ros2Port {
                 continue;
             };
             let who = match self.domain.nodes_of(&bridge).as_slice() {
-                [] => format!("participant {}, no ROS node by now,", hex(&bridge)),
+                [] => format!("participant {} (no ROS node yet)", hex(&bridge)),
                 nodes => format!("participant {} ({})", hex(&bridge), nodes.join(", ")),
             };
             let domain = self.domain_id;
             if is_possible(self.policy.mapping(), space, domain) {
                 self.policy.told.once(&bridge_topic(number), "bridge", || {
                     format!(
-                        "{who} says it is the bridge of space {space} in domain {domain}: its values are left to it"
+                        "{who} announces that it is the bridge of space {space} in domain {domain}: this \
+                         bridge leaves the values of the space to it"
                     )
                 });
             } else {
                 self.policy.told.once(&bridge_topic(number), "no bridge", || {
                     format!(
-                        "{who} says it is the bridge of space {space}, which the mapping has in another domain than \
-                         {domain}: it is not believed"
+                        "ignored {who}, which announces that it is the bridge of space {space}: the mapping \
+                         has the space in another domain than {domain}"
                     )
                 });
             }

@@ -31,7 +31,8 @@ impl Ros2Port {
         for (topic, service) in self.calls.chosen(&self.policy) {
             if is_offered(&self.graph, &snapshot, &service) {
                 self.policy.told.once(&service, "taken", || {
-                    format!("{topic} is not offered as {service}: another node has such a service")
+                    format!("{topic} is not offered as {service}: another node already offers this service; \
+                             use another name, or stop the node")
                 });
                 taken.push(service);
             }
@@ -141,7 +142,7 @@ impl Ros2Port {
                 let types: Vec<String> = types.into_iter().collect();
                 self.policy.told.once(&name, told, || {
                     format!(
-                        "the {noun} {name} cannot be asked for from other spaces: its type is {}",
+                        "the {noun} {name} is not offered to other spaces: its type is {}",
                         types.join(" and ")
                     )
                 });

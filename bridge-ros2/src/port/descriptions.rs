@@ -140,7 +140,11 @@ impl Ros2Port {
         };
         let alike: Vec<GUID> = endpoints.iter().filter(alike).map(|it| it.guid).collect();
         let met = inquiry.meet(alike.iter().copied(), |guid| self.graph.holds(guid), now);
-        self.tell_untold(&wanted, met, "they leave before they could tell it");
+        self.tell_untold(
+            &wanted,
+            met,
+            "the nodes that use it left before they described it",
+        );
         self.ask(&wanted, &alike, &mut inquiry, now);
         let settled = !inquiry.is_waited_for();
         self.descriptions.asked.insert(wanted, inquiry);

@@ -40,9 +40,17 @@ impl Ros2Port {
         let calls = calls.fold(ServiceCounters::default(), ServiceCounters::plus);
         let totals = [
             (Reason::Malformed, "request of a call", calls.malformed),
-            (Reason::CallFailed, "call without a reply", calls.failures),
+            (
+                Reason::CallFailed,
+                "call without a response",
+                calls.failures,
+            ),
             (Reason::Overflow, "request of a call", calls.overflowed),
-            (Reason::NotPublished, "reply of a call", calls.undelivered),
+            (
+                Reason::NotPublished,
+                "response to a call",
+                calls.undelivered,
+            ),
             (
                 Reason::Malformed,
                 "list of nodes",

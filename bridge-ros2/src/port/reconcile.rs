@@ -106,7 +106,10 @@ impl Ros2Port {
         if made == 0 {
             let count = lost.len();
             self.policy.told.once("", "unannounced", || {
-                format!("{count} endpoints of services or of the node were not announced by the DDS stack; start again")
+                format!(
+                    "the DDS stack did not announce {count} endpoints of services or of the node; \
+                         restart the bridge"
+                )
             });
         } else {
             warn!(
@@ -138,7 +141,9 @@ impl Ros2Port {
             let read = self.sources.iter().filter(|s| !s.values.is_empty());
             if read.count() >= MAX_TOPICS {
                 self.policy.told.once("", "too many topics", || {
-                    format!("more than {MAX_TOPICS} topics of the space: the rest is left alone")
+                    format!(
+                        "more than {MAX_TOPICS} topics of the space: the bridge ignores the others"
+                    )
                 });
                 return;
             }
@@ -154,7 +159,7 @@ impl Ros2Port {
                 self.tell_scarce();
                 self.events.push_back(PortEvent::Dropped {
                     reason: Reason::TooManyTopics,
-                    why: "topics that there are no file descriptors for",
+                    why: "not enough file descriptors for the topic",
                     count: 1,
                 });
                 return;
@@ -174,9 +179,9 @@ impl Ros2Port {
         let limit = self.descriptors.limit();
         self.policy.told.once("", "descriptors", || {
             format!(
-                "three quarters of the {limit} file descriptors of this process are in use: further topics that the mapping \
-                 does not name are left alone; raise the limit (`LimitNOFILE=`, `ulimit -n`), or end the nodes that \
-                 publish so many topics of the space"
+                "three quarters of the {limit} file descriptors of this process are in use: the bridge \
+                 ignores further topics that the mapping does not name; raise the limit (`LimitNOFILE=`, \
+                 `ulimit -n`), or stop the nodes that publish so many topics of the space"
             )
         });
     }
@@ -218,7 +223,7 @@ impl Ros2Port {
             Found::Named(topic) => Some((dds_topic, topic, Selection::Whole)),
             Found::Tied(topic) => {
                 self.policy.told.once(&dds_topic, "tied elsewhere", || {
-                    format!("{topic} comes from another ROS topic or a service, as the mapping says; this one is left alone")
+                    format!("ignored this topic: by the mapping, {topic} comes from another ROS topic or a service")
                 });
                 None
             }
@@ -262,8 +267,8 @@ impl Ros2Port {
     fn tell_unknown(&mut self, topic: TopicId, dds_topic: &str, error: &str) {
         let first = self.policy.told.once(dds_topic, "unknown type", || {
             format!(
-                "the topic cannot cross: {error}. Start the bridge where the ROS workspace that defines it is sourced \
-                 (AMENT_PREFIX_PATH), or map the topic to a known type"
+                "cannot bridge the topic: {error}. Start the bridge where the ROS workspace that defines it \
+                 is sourced (AMENT_PREFIX_PATH), or map the topic to a known type"
             )
         });
         if first {
@@ -408,7 +413,7 @@ impl Ros2Port {
             Ok(definition) => definition,
             Err(error) => {
                 let values: Vec<_> = source.values.iter().map(|(topic, _)| *topic).collect();
-                let first = self.tell_unknown_type(&topic, "the topic cannot cross", &error);
+                let first = self.tell_unknown_type(&topic, "cannot bridge the topic", &error);
                 if first {
                     let uncrossed = values.into_iter();
                     self.events.extend(
@@ -426,7 +431,7 @@ impl Ros2Port {
         if let Some(source) = self.sources.get_mut(index) {
             source.reading = Reading::Open { slot, requested };
             source.announced = source.announced.or(definition.hash);
-            info!(topic, message_type = %name, definition = %definition.from, ?requested, "subscribed");
+            info!(topic, message_type = %name, definition = %definition.from, %requested, "subscribed");
             for (topic, selection) in &source.values {
                 self.events.push_back(PortEvent::Bound {
                     topic: *topic,
@@ -469,7 +474,7 @@ impl Ros2Port {
             }
             debug!(
                 topic,
-                ?requested,
+                %requested,
                 "subscribed again because the publishers changed"
             );
         }
@@ -502,8 +507,8 @@ impl Ros2Port {
             let owner = self.domain.owner(stranger.guid);
             self.policy.told.once(&topic, OTHER_DEFINITION, || {
                 format!(
-                    "a publisher of {} has another definition of {name}, with the hash {theirs}; the topic crosses with \
-                     {ours}: its messages are dropped",
+                    "messages of a publisher of {} are dropped: its definition of {name} has the hash \
+                     {theirs}, but the topic uses {ours}; build both sides from the same definition",
                     owner.as_deref().unwrap_or("an unnamed node"),
                 )
             });
@@ -511,7 +516,7 @@ impl Ros2Port {
         }
         self.policy.told.once(&topic, OTHER_TYPE, || {
             format!(
-                "a publisher has type {}, but the topic crosses as {name}: its messages are dropped",
+                "messages of a publisher are dropped: its type is {}, but the topic uses {name}",
                 stranger.type_name
             )
         });
@@ -551,7 +556,7 @@ impl Ros2Port {
             let owner = self.domain.owner(guid);
             self.policy.told.once(&dds_topic, found.policy, || {
                 format!(
-                    "a {peer} of {} is not matched: in {} {} is offered and {} requested",
+                    "a {peer} of {} is not connected: for the QoS policy {}, {} is offered and {} requested",
                     owner.as_deref().unwrap_or("an unnamed node"),
                     found.policy,
                     found.offered,

@@ -33,8 +33,8 @@ impl ServiceGraph for Ros2Graph<'_> {
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
         self.definitions.service(name).map_err(|error| {
             let wanted = format!(
-                "discovery does not bring the definition of a service, so a prefix in AMENT_PREFIX_PATH must \
-                 have share/{}/srv/{}.srv",
+                "discovery does not carry the definition of a service: a prefix in AMENT_PREFIX_PATH must \
+                 contain share/{}/srv/{}.srv",
                 name.package(),
                 name.name()
             );

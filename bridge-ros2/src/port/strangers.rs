@@ -78,7 +78,7 @@ impl Strangers {
             }
             AuthenticationStatus::Rejected => {
                 self.waiting.remove(&participant);
-                let why = "it is not secured, or by another governance or without permission here";
+                let why = "it has no DDS Security, other governance settings, or no permission in this domain";
                 Some(Stranger { participant, why })
             }
         }
@@ -104,7 +104,7 @@ impl Strangers {
         let strangers: Vec<Stranger> = overdue
             .map(|(participant, _)| Stranger {
                 participant: *participant,
-                why: "it does not prove who it is: its certificate may be of another identity CA",
+                why: "it did not authenticate; its certificate may come from another identity CA",
             })
             .collect();
         for stranger in &strangers {
@@ -120,7 +120,7 @@ impl std::fmt::Display for Stranger {
         for byte in self.participant {
             write!(f, "{byte:02x}")?;
         }
-        write!(f, " is kept out: {}", self.why)
+        write!(f, " is rejected: {}", self.why)
     }
 }
 

@@ -32,7 +32,7 @@ impl Ros2Port {
             self.tell_scarce();
             self.events.push_back(PortEvent::Dropped {
                 reason: Reason::TooManyTopics,
-                why: "values that there are no file descriptors for",
+                why: "not enough file descriptors for the value",
                 count: 1,
             });
             return false;
@@ -40,7 +40,7 @@ impl Ros2Port {
         if is_stray && !self.take_place() {
             self.events.push_back(PortEvent::Dropped {
                 reason: Reason::TooManyTopics,
-                why: "values that the mapping does not name and nobody subscribes to",
+                why: "values without an entry in the mapping and without a subscriber",
                 count: 1,
             });
             return false;

@@ -30,7 +30,7 @@ impl Ros2Port {
                 self.events.extend(unwritten(topic, &open));
                 self.policy.told.once(&dds_topic, "at home", || {
                     format!(
-                        "another bridge of this domain serves space {}: its values are left to it",
+                        "another bridge of this domain serves space {}: this bridge does not write values of the space",
                         topic.space
                     )
                 });
@@ -96,7 +96,8 @@ impl Ros2Port {
         if let Some(other) = of_another_type {
             self.policy.told.once(&dds_topic, "subscriber of another type", || {
                 format!(
-                    "a subscriber asks for the type {other}, the topic is written in {dds_type}: it gets no values"
+                    "a subscriber requests the type {other}, but the topic has the type {dds_type}: the \
+                     subscriber receives no values"
                 )
             });
         }
@@ -112,8 +113,8 @@ impl Ros2Port {
             let owner = self.domain.owner(reader.guid);
             self.policy.told.once(&dds_topic, OTHER_DEFINITION_READ, || {
                 format!(
-                    "a subscriber of {} has another definition of {name}, with the hash {theirs}; the topic is written with \
-                     {ours}: it may misread the values",
+                    "a subscriber of {} may misread the values: its definition of {name} has the hash \
+                     {theirs}, but the bridge writes with {ours}; build both sides from the same definition",
                     owner.as_deref().unwrap_or("an unnamed node"),
                 )
             });
@@ -199,7 +200,7 @@ impl Ros2Port {
                     break;
                 }
                 Err(error) => {
-                    let what = "no value can be written in the type asked for";
+                    let what = "the requested type cannot hold the value";
                     self.tell_unknown_type(&dds_topic, what, &error);
                 }
             }
@@ -225,7 +226,7 @@ impl Ros2Port {
         else {
             return;
         };
-        info!(topic = dds_topic, message_type = %definition.name(), definition = %definition.from, ?offered, "advertised");
+        info!(topic = dds_topic, message_type = %definition.name(), definition = %definition.from, %offered, "advertised");
         let mut outlet = Outlet::new(writer, offered, self.domain.joined());
         if let Err(refusal) = outlet.set_readers(&readers, Instant::now()) {
             self.events.push_back(lost(topic, refusal.cause(), 1));
@@ -260,7 +261,7 @@ pub(super) fn unwritten(topic: TopicId, open: &Open) -> Option<PortEvent> {
     (waiting > 0).then(|| {
         lost(
             topic,
-            (Reason::Overflow, "its writer was given up"),
+            (Reason::Overflow, "the writer of the topic was replaced"),
             waiting,
         )
     })

@@ -22,8 +22,8 @@ pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
         return Err(Enclave::fault(
             folder,
             REVOKED,
-            "RustDDS would not look at this list of revoked certificates and let them in: make a new keystore \
-             without those nodes",
+            "RustDDS ignores this list of revoked certificates and would accept them: create a new keystore \
+             without the revoked nodes",
         ));
     }
     let identity_ca = certificate(folder, "identity_ca.cert.pem")?;
@@ -35,14 +35,14 @@ pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
     if !signed.unwrap_or(false) {
         return fault(
             "cert.pem",
-            "this certificate is not signed by identity_ca.cert.pem: take both from one keystore",
+            "this certificate is not signed by identity_ca.cert.pem: use both files from the same keystore",
         );
     }
     let key = private_key(folder)?;
     if !own.public_key().is_ok_and(|public| public.public_eq(&key)) {
         return fault(
             "key.pem",
-            "this key is not that of cert.pem: take both from one enclave",
+            "this key does not match cert.pem: use both files from the same enclave",
         );
     }
     let governance = signed_document(folder, GOVERNANCE, &permissions_ca)?;
@@ -72,13 +72,13 @@ fn certificate(folder: &Path, file: &str) -> Result<X509, SecurityError> {
     let now = Asn1Time::days_from_now(0).map_err(|error| fault(error.to_string()))?;
     if found.not_after() < &*now {
         return Err(fault(format!(
-            "this certificate expired on {}: make the enclave anew, or mend the clock of this machine",
+            "this certificate expired on {}: create the enclave again, or set the clock of this host",
             found.not_after()
         )));
     }
     if found.not_before() > &*now {
         return Err(fault(format!(
-            "this certificate is not valid before {}: mend the clock of this machine",
+            "this certificate is not valid before {}: set the clock of this host",
             found.not_before()
         )));
     }
@@ -91,12 +91,12 @@ fn private_key(folder: &Path) -> Result<PKey<Private>, SecurityError> {
     let text = String::from_utf8_lossy(&pem);
     if text.contains("ENCRYPTED") {
         return Err(fault(
-            "this key is encrypted with a password, which nobody could type: `openssl pkey` takes it off",
+            "this key is encrypted with a password: remove the password with `openssl pkey`",
         ));
     }
     if !text.contains("-----BEGIN PRIVATE KEY-----") {
         return Err(fault(
-            "not a key in PKCS#8, the form of `ros2 security`: `openssl pkcs8 -topk8 -nocrypt` makes it of others",
+            "not a PKCS#8 key, as `ros2 security` writes it: convert it with `openssl pkcs8 -topk8 -nocrypt`",
         ));
     }
     PKey::private_key_from_pem(&pem).map_err(|error| fault(&format!("not a private key: {error}")))
@@ -124,7 +124,8 @@ fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<String
             folder,
             file,
             format!(
-                "its signature is not by permissions_ca.cert.pem, or the text was changed since ({}): sign it anew",
+                "its signature is not from permissions_ca.cert.pem, or the text was changed after signing \
+                 ({}): sign it again",
                 why.unwrap_or("no reason given")
             ),
         )
@@ -149,8 +150,9 @@ fn not_found(governance: &str) -> Option<String> {
             (false, false) => return None,
         };
         Some(format!(
-            "with rtps_protection_kind {rtps} and {open}, nodes of Cyclone DDS are not found: they tell of their topics \
-             in datagrams that are not protected, which are not let in. Protect discovery, or no datagrams as a whole"
+            "with rtps_protection_kind {rtps} and {open}, nodes of Cyclone DDS are not discovered: they \
+             announce their topics in unprotected datagrams, which are dropped. Enable \
+             discovery protection, or set rtps_protection_kind to NONE"
         ))
     })
 }
@@ -169,7 +171,7 @@ fn readable_by_others(folder: &Path) -> Option<String> {
     let mode = fs::metadata(&path).ok()?.permissions().mode() & 0o777;
     (mode & 0o077 != 0).then(|| {
         format!(
-            "{}: others on this machine can read this key (mode {mode:o}): chmod 600",
+            "{}: other users of this host can read this key (mode {mode:o}): chmod 600",
             path.display()
         )
     })

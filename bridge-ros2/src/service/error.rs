@@ -46,10 +46,10 @@ impl fmt::Display for CallPhase {
         f.write_str(match self {
             Self::Queue => "waiting for earlier calls",
             Self::Discovery => {
-                "waiting for a node that offers it (`ros2 service list` shows what there is)"
+                "waiting for a node that offers it (`ros2 service list` shows the available services)"
             }
             Self::Request => "sending the request",
-            Self::Answer => "waiting for the answer",
+            Self::Answer => "waiting for the response",
         })
     }
 }
@@ -59,7 +59,7 @@ impl fmt::Display for CallPhase {
 #[non_exhaustive]
 pub enum ServiceError {
     /// The timeout of the call has expired.
-    #[error("{service}: the call was given up after {limit:?} while {phase}")]
+    #[error("{service}: no response within {limit:?}, while {phase}")]
     Timeout {
         /// The service.
         service: String,
@@ -69,13 +69,13 @@ pub enum ServiceError {
         limit: Duration,
     },
     /// Every server that received the request has left or its lease has expired.
-    #[error("the servers of {service} left before they answered")]
+    #[error("the servers of {service} left the domain before they responded")]
     Lost {
         /// The service.
         service: String,
     },
     /// A server exists, but with another type.
-    #[error("{service} has the type {theirs}, and {ours} is wanted")]
+    #[error("{service} has the type {theirs}, but {ours} is required")]
     OtherType {
         /// The service.
         service: String,
@@ -85,7 +85,7 @@ pub enum ServiceError {
         ours: String,
     },
     /// The client has reached its limit of concurrent calls.
-    #[error("{limit} calls of {service} are in progress already")]
+    #[error("the limit of {limit} calls of {service} in progress is reached")]
     Busy {
         /// The service.
         service: String,
@@ -101,7 +101,7 @@ pub enum ServiceError {
         why: &'static str,
     },
     /// The reply does not have the service's type.
-    #[error("the reply of {service} does not read")]
+    #[error("the response of {service} is malformed")]
     Reply {
         /// The service.
         service: String,

@@ -312,7 +312,7 @@ impl Driver {
             let result = match limit {
                 None => answer.await,
                 Some(limit) => timeout(limit, answer).await.unwrap_or_else(|_| {
-                    Err(format!("its handler gave no answer within {limit:?}"))
+                    Err(format!("its handler did not respond within {limit:?}"))
                 }),
             };
             (to, result)
@@ -323,10 +323,10 @@ impl Driver {
         if self.counters.failures.fetch_add(1, Ordering::Relaxed) == 0 {
             warn!(
                 service = self.service.name,
-                why, "a call gets no answer; others are not told of"
+                why, "a call gets no response; further ones are logged at DEBUG"
             );
         } else {
-            debug!(service = self.service.name, why, "a call gets no answer");
+            debug!(service = self.service.name, why, "a call gets no response");
         }
     }
 
