@@ -248,7 +248,7 @@ impl ForeignSkills {
                 continue;
             };
             let why = format!(
-                "another component has a skill of that name too, at {topic}: `ua-space call` takes either by its number"
+                "another component has a skill with the same name, at {topic}: choose between them in `ua-space call` by number"
             );
             if server.faults.insert(same.clone(), why.clone()).is_none() {
                 warn!(server = server.of.name, skill = same, "{why}");
@@ -314,7 +314,7 @@ fn show(
             server = of.name,
             url = of.endpoint,
             skill = name,
-            "not as it should be in the space: {why}"
+            "cannot show a skill of another server as it is: {why}"
         );
     }
     server.faults = faults;
@@ -505,7 +505,7 @@ async fn look(of: Foreign, tell: mpsc::Sender<News>) {
                             warn!(
                                 server = of.name,
                                 url = of.endpoint,
-                                "it does not tell its skills: {fault}"
+                                "cannot read the skills of another server: {fault}"
                             );
                             trouble = fault;
                         }

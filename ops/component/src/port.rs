@@ -147,7 +147,7 @@ impl ComponentPort {
         let announced = announce(told, component, options, settings.supervision);
         if server.skills().len() > MOST_IN_SPACE {
             warn!(
-                "only the first {MOST_IN_SPACE} skills have a place in the space; OPC UA has all"
+                "more than {MOST_IN_SPACE} skills: the others are only available over OPC UA, not in the space"
             );
         }
         info!(
@@ -355,7 +355,7 @@ impl Port for ComponentPort {
             tokio::join!(leaving, self.server.stop())
         });
         if ended.await.is_err() {
-            warn!("not all connections were closed in time");
+            warn!("dropped the connections that did not close in time");
         }
     }
 }
@@ -553,7 +553,7 @@ fn announce(
     match discovery::announce(server, settings) {
         Ok(announced) => Some(announced),
         Err(fault) => {
-            warn!("nobody is told of the component by mDNS: {fault}");
+            warn!("cannot announce this component by mDNS: {fault}");
             None
         }
     }

@@ -16,57 +16,58 @@ use crate::store::{Issued, Store, new_key, pem_of, write_key};
 
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum CaVerb {
-    /// Make the authority of a plant: its key and its certificate, which everybody is to trust
+    /// Make the authority of a plant: its key and its certificate, which all programs have to trust
     Init {
-        /// What it is called
+        /// The common name in the certificate
         #[arg(long, value_name = "NAME", default_value = "Plant authority")]
         name: String,
-        /// Whose it is
+        /// The organization in the certificate
         #[arg(long, value_name = "NAME", default_value = "")]
         organization: String,
-        /// How many days it is valid
+        /// Validity in days
         #[arg(long, value_name = "DAYS", default_value = "3650", value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
         #[command(flatten)]
         folders: Folders,
     },
-    /// Issue a certificate for a signing request in DER or PEM; without one for a key that is made
+    /// Issue a certificate for a signing request in DER or PEM, or without a request for a new key
     Issue {
         /// The signing request
         #[arg(value_name = "REQUEST", required_unless_present = "application_uri", conflicts_with_all = ["application_uri", "host", "name"])]
         request: Option<PathBuf>,
-        /// The ApplicationUri of an application that is to get a key, too
+        /// The ApplicationUri of an application that gets a new key
         #[arg(long, value_name = "URI", requires = "key")]
         application_uri: Option<String>,
-        /// What it is called
+        /// The common name in the certificate
         #[arg(long, value_name = "NAME", default_value = "")]
         name: String,
-        /// A host it is reached under; may be given several times
+        /// A host of the application; may be repeated
         #[arg(long, value_name = "HOST")]
         host: Vec<String>,
-        /// Where its key goes, as PEM
+        /// File for the key, as PEM
         #[arg(long, value_name = "FILE")]
         key: Option<PathBuf>,
-        /// Where the certificate goes: DER, or PEM for a name that ends with .pem
+        /// File for the certificate: DER, or PEM for a name that ends with .pem
         #[arg(long, value_name = "FILE")]
         out: PathBuf,
-        /// How many days it is valid
+        /// Validity in days
         #[arg(long, value_name = "DAYS", default_value = "365", value_parser = clap::value_parser!(u32).range(1..=36_500))]
         days: u32,
         #[command(flatten)]
         folders: Folders,
     },
-    /// Revoke a certificate that was issued. A server that runs knows at once; others when they have the new list
+    /// Revoke an issued certificate. The running ua-gds applies it at once, other programs when
+    /// they receive the new list
     Revoke {
-        /// Its number, as `list` has it, or its file
+        /// Its number in `list`, or its file
         #[arg(value_name = "SERIAL|FILE")]
         which: String,
         #[command(flatten)]
         folders: Folders,
     },
-    /// List what was issued, with what is revoked
+    /// List the issued and revoked certificates
     List {
-        /// A JSON line for each
+        /// Print a JSON line for each
         #[arg(long)]
         json: bool,
         #[command(flatten)]
@@ -92,7 +93,7 @@ pub(crate) fn run(verb: CaVerb) -> Result<(), Failure> {
                 day(store.certificate().validity().1)
             ))?;
             say(&format!(
-                "to be trusted by servers and clients: {} with the list {}",
+                "servers and clients must trust: {} with the list {}",
                 store.certificate_path().display(),
                 store.list_path().display()
             ))
@@ -131,7 +132,7 @@ pub(crate) fn run(verb: CaVerb) -> Result<(), Failure> {
                 .map_err(|fault| of_store(&fault))?;
             say(&format!("revoked: {serial}"))?;
             say(&format!(
-                "the new list, for those that do not fetch it: {}",
+                "the new list, for programs that do not fetch it: {}",
                 store.list_path().display()
             ))
         }
@@ -152,7 +153,7 @@ pub(crate) fn open(folders: &Folders) -> Result<Store, Failure> {
 fn read_request(file: &Path) -> Result<Request, Failure> {
     let bytes = read(file)?;
     Request::read(&bytes).map_err(|why| {
-        let message = format!("{} is no signing request: {why}", file.display());
+        let message = format!("{} is not a signing request: {why}", file.display());
         Failure::new(FailureKind::Usage, message)
     })
 }
@@ -175,13 +176,14 @@ fn with_key(
 ) -> Result<Request, Failure> {
     let usage = |why: String| Failure::new(FailureKind::Usage, why);
     let Some(file) = file else {
-        return Err(usage("--key FILE: where the key is to go".to_owned()));
+        return Err(usage("--key FILE: give the file for the key".to_owned()));
     };
     let key = new_key(KEY_BITS).map_err(|fault| of_store(&fault))?;
     let name = if name.is_empty() { uri } else { name };
     let name: String = name.chars().take(LONGEST_NAME).collect();
     let wanted = Request::make(&key, uri, (&name, ""), hosts);
-    let wanted = wanted.map_err(|why| usage(format!("no certificate of {uri:?}: {why}")))?;
+    let wanted =
+        wanted.map_err(|why| usage(format!("cannot issue a certificate for {uri:?}: {why}")))?;
     let pem = pem_of(&key).map_err(|fault| of_store(&fault))?;
     write_key(file, &pem).map_err(|error| io_fault(file, &error))?;
     Ok(wanted)
@@ -194,7 +196,7 @@ fn serial(which: &str) -> Result<Serial, Failure> {
         return read.map(|one| one.serial()).map_err(|why| {
             Failure::new(
                 FailureKind::Usage,
-                format!("{which} is no certificate: {why}"),
+                format!("{which} is not a certificate: {why}"),
             )
         });
     }

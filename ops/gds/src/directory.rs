@@ -56,7 +56,7 @@ impl Gds {
         let (uri, urls) = (record.uri.clone(), record.urls.clone());
         let registered = self.records.lock().register(record);
         let number = registered.map_err(|fault| unregistered(&fault, caller))?;
-        info!(application = ?uri, ?urls, number, by = ?caller.user, "an application is registered");
+        info!(application = ?uri, ?urls, number, by = ?caller.user, "registered an application");
         Ok(id(number))
     }
 
@@ -72,7 +72,7 @@ impl Gds {
         let uri = record.uri.clone();
         let updated = self.records.lock().update(record);
         updated.map_err(|fault| unregistered(&fault, caller))?;
-        info!(application = ?uri, by = ?caller.user, "an application is registered otherwise");
+        info!(application = ?uri, by = ?caller.user, "changed the registration of an application");
         Ok(())
     }
 }
@@ -90,7 +90,7 @@ pub(crate) fn unregister(gds: &Gds, request: &MethodRequest) -> Answer {
     gds.revoke(&issued, now).map_err(|fault| refused(&fault))?;
     let gone = gds.records.lock().remove(known.number);
     gone.map_err(|fault| unregistered(&fault, caller))?;
-    info!(application = ?known.uri, by = ?caller.user, "an application is registered no longer");
+    info!(application = ?known.uri, by = ?caller.user, "removed the registration of an application");
     Ok(Vec::new())
 }
 

@@ -52,13 +52,13 @@ pub(crate) struct Shows<'a> {
 /// The reason why a token is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Uninvited {
-    #[error("no invitation has the token")]
+    #[error("unknown token of an invitation")]
     Unknown,
     #[error("the invitation has expired")]
     Expired,
     #[error("another application has used the invitation")]
     Used,
-    #[error("the invitation is for another application")]
+    #[error("the invitation belongs to another application")]
     Another,
 }
 

@@ -36,16 +36,18 @@ use crate::serve::{Settings, serve};
 
 /// The Global Discovery Server of a plant: registers its applications, and issues and revokes their certificates.
 ///
-/// A program gets its first certificate with an invitation (`ua-gds invite`), or once an administrator has approved its request
-/// (`ua-gds requests`, `ua-gds approve`). Otherwise a user with the role security_admin registers an application or requests its
-/// certificate, or the application itself by a certificate that is trusted here, over an encrypted channel. Everybody may ask who is registered. Users and
-/// trusted certificates are those of the certificate store (`ua-server user` and `ua-server trust` with its --pki).
+/// A program gets its first certificate with an invitation (`ua-gds invite`), or once an
+/// administrator has approved its request (`ua-gds requests`, `ua-gds approve`). Otherwise a user
+/// with the role security_admin, or the application itself with a trusted certificate, registers it
+/// or requests its certificate over an encrypted channel. Every client may list the registered
+/// applications. Users and trusted certificates are in the certificate store (`ua-server user` and
+/// `ua-server trust` with its --pki).
 #[derive(Debug, clap::Parser)]
 #[command(name = "ua-gds", version = plant_opcua::patches::version(), args_conflicts_with_subcommands = true)]
 struct UaGds {
     #[command(subcommand)]
     verb: Option<Verb>,
-    /// Where clients connect
+    /// The endpoint URL for clients
     #[arg(
         long,
         value_name = "URL",
@@ -55,17 +57,18 @@ struct UaGds {
     endpoint: EndpointUrl,
     #[command(flatten)]
     folders: Folders,
-    /// How many days a certificate is valid that is issued to an application
+    /// Validity of issued certificates in days
     #[arg(long, value_name = "DAYS", default_value = "365", value_parser = clap::value_parser!(u32).range(1..=36_500))]
     days: u32,
-    /// The local discovery server it registers with; `embed` for that of this host at port 4840, or `embed=URL`, which the
-    /// program is itself while there is none
+    /// The local discovery server to register at; `embed` for the discovery server of this host at
+    /// port 4840, or `embed=URL`: the program itself is the discovery server while no other runs
+    /// there
     #[arg(long, value_name = "URL|embed", env = "UA_LDS")]
     lds: Option<String>,
-    /// The network interface where it is announced by mDNS, by name or address
+    /// The network interface for mDNS announcements, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     interface: Option<String>,
-    /// How log lines look
+    /// The format of the log
     #[arg(
         long,
         value_name = "FORMAT",
@@ -77,7 +80,7 @@ struct UaGds {
 
 #[derive(Debug, clap::Subcommand)]
 enum Verb {
-    /// The authority for people: make it, issue, revoke and list certificates
+    /// Manage the authority: make it; issue, revoke and list certificates
     #[command(subcommand)]
     Ca(CaVerb),
     /// Invite a program into the plant, and list, approve and reject requests for certificates

@@ -62,7 +62,10 @@ impl MethodHandler for StartNewKeyPair {
         let record = gds.own(&request.caller, application)?;
         is_ours(gds, group, kind)?;
         if format.as_ref() != "PEM" || !password.as_ref().is_empty() {
-            return Err(unfit(&record, "keys are made as PEM without a password"));
+            return Err(unfit(
+                &record,
+                "only keys as PEM without a password are supported",
+            ));
         }
         let (name, organization) = parts(subject, &record);
         let hosts = texts(hosts);
@@ -114,7 +117,7 @@ pub(crate) fn revoke(gds: &Gds, request: &MethodRequest) -> Answer {
     let issued = gds.store.lock().of_application(&record.uri);
     let issued = issued.map_err(|fault| refused(&fault))?;
     if !issued.contains(&certificate) {
-        return Err(unfit(&record, "it has no such certificate"));
+        return Err(unfit(&record, "the application has no such certificate"));
     }
     gds.revoke(&[certificate], now())
         .map_err(|fault| refused(&fault))?;
@@ -246,7 +249,7 @@ impl Gds {
                 if wanted.challenge().is_some() {
                     return Err(unfit(
                         record,
-                        "a challengePassword is for the first certificate of an application",
+                        "a challengePassword is allowed only for the first certificate of an application",
                     ));
                 }
                 self.keep_checked(caller, record, (wanted, &waiting))
@@ -313,7 +316,7 @@ impl Gds {
     /// invitation it is approved, otherwise it waits for an administrator.
     fn apply(&self, record: &Record, wanted: Request, key: Fingerprint) -> Result<u32, Refusal> {
         if wanted.key_fingerprint() != key {
-            return Err(unfit(record, "it is for another key than the channel's"));
+            return Err(unfit(record, "its key differs from the key of the channel"));
         }
         match wanted.challenge().map(str::to_owned) {
             Some(token) => self.redeem(record, &wanted, (&token, key)),
@@ -483,7 +486,7 @@ pub(crate) fn kind() -> NodeId {
 }
 
 pub(crate) fn unfit(record: &Record, why: &str) -> Refusal {
-    info!(application = ?record.uri, "what is asked for a certificate is refused: {why}");
+    info!(application = ?record.uri, "refused a certificate request: {why}");
     StatusCode::BadInvalidArgument.into()
 }
 

@@ -23,16 +23,17 @@ use crate::service::now;
 
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum PeopleVerb {
-    /// Print an invitation for one program, to be given to it as --gds: the URL of this server, the fingerprint of its certificate
-    /// and a one-time token, with which the program gets its certificate without an administrator
+    /// Print an invitation for a program, to give to it as --gds: the URL of this server, the
+    /// fingerprint of its certificate and a one-time token. With the token the program gets its
+    /// certificate without an administrator
     Invite {
-        /// The only application that may use it: its ApplicationUri, or its name
+        /// The application that may use the invitation: its ApplicationUri or its name
         #[arg(value_name = "APPLICATION")]
         application: Option<String>,
-        /// How many hours it may be used
+        /// Validity in hours
         #[arg(long, value_name = "HOURS", default_value = "24", value_parser = clap::value_parser!(u32).range(1..=8760))]
         hours: u32,
-        /// Where programs reach this server
+        /// The URL of this server for other programs
         #[arg(
             long,
             value_name = "URL",
@@ -43,17 +44,17 @@ pub(crate) enum PeopleVerb {
         #[command(flatten)]
         folders: Folders,
     },
-    /// List the requests for certificates, and the invitations that may be used
+    /// List the certificate requests and the valid invitations
     Requests {
-        /// A JSON line for each
+        /// Print a JSON line for each
         #[arg(long)]
         json: bool,
         #[command(flatten)]
         folders: Folders,
     },
-    /// Approve a request: the program gets the certificate when it asks for it again
+    /// Approve a request: the program gets the certificate with its next request
     Approve {
-        /// Its number, as `requests` has it
+        /// Its number in `requests`
         #[arg(value_name = "NUMBER")]
         number: u32,
         #[command(flatten)]
@@ -61,7 +62,7 @@ pub(crate) enum PeopleVerb {
     },
     /// Reject a request, or withdraw an invitation
     Reject {
-        /// Its number, as `requests` has it
+        /// Its number in `requests`
         #[arg(value_name = "NUMBER")]
         number: String,
         #[command(flatten)]
@@ -96,7 +97,10 @@ fn invite(
         .value
         .and_then(|bytes| bytes.try_into().ok());
     let random = random.ok_or_else(|| {
-        Failure::new(FailureKind::Io, "the system has no random bytes".to_owned())
+        Failure::new(
+            FailureKind::Io,
+            "the operating system provides no random bytes".to_owned(),
+        )
     })?;
     let life = Duration::from_secs(u64::from(hours) * 3600);
     let token = change(folders, invitations::FILE, |all: &mut Invitations| {
@@ -115,8 +119,8 @@ fn invite(
     // The hint goes to stderr, because a script may read the invitation from stdout.
     let _nobody_reads = writeln!(
         io::stderr(),
-        "give it to one program as --gds INVITATION, in the variable UA_GDS, or in a file as --gds @FILE; it is valid for \
-         {hours} h, once"
+        "give it to a program as --gds INVITATION, in the variable UA_GDS, or in a file as --gds @FILE; it \
+         can be used once within {hours} h"
     );
     Ok(())
 }

@@ -33,13 +33,13 @@ pub(crate) struct Record {
 /// The reason why an application is refused.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum RecordFault {
-    #[error("an application of that ApplicationUri is registered already")]
+    #[error("an application with this ApplicationUri is already registered")]
     Present,
-    #[error("no such application is registered")]
+    #[error("the application is not registered")]
     Unknown,
     #[error("{0}")]
     Unfit(&'static str),
-    #[error("{MOST_RECORDS} applications are registered, and there is no room for more")]
+    #[error("the limit of {MOST_RECORDS} registered applications is reached")]
     Full,
     #[error("{path}: {source}")]
     Io {
@@ -142,7 +142,7 @@ impl Records {
         let known = all.iter_mut().find(|one| one.number == record.number);
         let known = known.ok_or(RecordFault::Unknown)?;
         if known.uri != record.uri {
-            return Err(RecordFault::Unfit("the ApplicationUri is another"));
+            return Err(RecordFault::Unfit("the ApplicationUri differs"));
         }
         record.confirm(&known.confirmed);
         if *known == record {
@@ -347,11 +347,11 @@ pub(crate) fn check(record: &Record) -> Result<(), RecordFault> {
     fits(!record.names.is_empty(), "it has no name")?;
     fits(
         !record.is_server() || !record.urls.is_empty(),
-        "a server without a discovery URL",
+        "the server has no discovery URL",
     )?;
     fits(
         !record.is_server() || !record.capabilities.is_empty(),
-        "a server without capabilities (`NA` says that it has none)",
+        "the server has no capabilities (give `NA` for a server without any)",
     )?;
     let counts = [
         record.names.len(),
@@ -370,7 +370,7 @@ pub(crate) fn check(record: &Record) -> Result<(), RecordFault> {
         .chain(&record.urls)
         .chain(&record.capabilities)
         .chain([&record.uri, &record.product_uri]);
-    fits(texts.all(short), "a text that is too long")
+    fits(texts.all(short), "a text is too long")
 }
 
 /// Returns true if a text matches a pattern: `%` is any text, `_` is any character, and `\` escapes

@@ -162,7 +162,7 @@ impl Serving {
                 if let Some(suppressed) = self.gds.another("own certificate") {
                     warn!(
                         suppressed,
-                        "cannot renew the server's own certificate: {fault}"
+                        "cannot renew the certificate of this server: {fault}"
                     );
                 }
             }
@@ -174,8 +174,8 @@ impl Serving {
             warn!(
                 until = own::day(until),
                 days_left = until.saturating_sub(now).as_secs() / DAY.as_secs(),
-                "the certificate of the authority ends, and no certificate that it issues lasts longer: make a new authority \
-                 (`ua-gds ca init` with another --authority) and have all programs trust it"
+                "the certificate of the authority expires soon, and its certificates expire with it: make a \
+                 new authority (`ua-gds ca init` with another --authority), and trust it in all programs"
             );
         }
     }

@@ -149,7 +149,7 @@ impl Gds {
         let store = self.store.lock();
         for one in gone {
             store.revoke(&one.serial(), now)?;
-            info!(name = ?one.name(), application = ?one.application_uri().unwrap_or_default(), serial = %one.serial(), "a certificate is revoked");
+            info!(name = ?one.name(), application = ?one.application_uri().unwrap_or_default(), serial = %one.serial(), "revoked a certificate");
         }
         drop(store);
         self.know(now)
@@ -166,7 +166,7 @@ impl Gds {
         list.der().clone_into(&mut known);
         drop(known);
         if let Err(error) = plant_opcua::known::put_crl(&self.pki, &list) {
-            warn!(%error, "the revocation list is not in the store of the server");
+            warn!(%error, "cannot add the revocation list to the store of the server");
         }
         Ok(())
     }
@@ -242,7 +242,7 @@ pub(crate) fn refused(fault: &StoreFault) -> StatusCode {
 
 /// Logs a fault of the register and returns the status for the caller.
 pub(crate) fn unregistered(fault: &RecordFault, caller: &Caller) -> StatusCode {
-    warn!(application = ?caller.application_uri, user = ?caller.user, "what a client tells of an application is refused: {fault}");
+    warn!(application = ?caller.application_uri, user = ?caller.user, "refused data of an application from a client: {fault}");
     match fault {
         RecordFault::Present => StatusCode::BadEntryExists,
         RecordFault::Unknown => StatusCode::BadNotFound,

@@ -37,23 +37,25 @@ pub(crate) enum StoreFault {
         #[source]
         source: io::Error,
     },
-    #[error("there is no authority in {0}: `ua-gds ca init` makes one")]
+    #[error("no authority in {0}: make it with `ua-gds ca init`")]
     Missing(PathBuf),
-    #[error("there is an authority in {0} already, and what it issued counts on it")]
+    #[error(
+        "{0} already contains an authority, which issued certificates depend on: give another --authority"
+    )]
     Present(PathBuf),
-    #[error("{path} cannot be used: {why}")]
+    #[error("cannot use {path}: {why}")]
     Unfit { path: PathBuf, why: Unfit },
     #[error(
-        "another ua-gds serves the authority in {0}: two would give one ApplicationId twice; end it, or give another --authority"
+        "another ua-gds already serves the authority in {0}: stop it, or give another --authority"
     )]
     Claimed(PathBuf),
-    #[error("{0} can be read by others than its owner: `chmod 600` it")]
+    #[error("other users can read {0}: `chmod 600` it")]
     Open(PathBuf),
-    #[error("no certificate that was issued here has the number {0} (`ua-gds ca list`)")]
+    #[error("no issued certificate has the number {0} (`ua-gds ca list`)")]
     Unknown(String),
-    #[error("no key can be made or read: {0}")]
+    #[error("cannot make or read a key: {0}")]
     Key(String),
-    #[error("what is asked for cannot be issued: {0}")]
+    #[error("cannot issue the certificate: {0}")]
     Request(Unfit),
 }
 

@@ -212,7 +212,7 @@ impl Cell {
             let left_out = left_out.join(", ");
             warn!(
                 component = facts.name,
-                left_out, "capabilities that are no IRIs are left out"
+                left_out, "ignored capabilities that are not IRIs"
             );
         }
         let source = Source::new(SourceKind::Component, &facts.application_uri);
@@ -220,7 +220,7 @@ impl Cell {
         if let Err(fault) = &taken {
             error!(
                 component = facts.name,
-                "what a component says is not taken into the graph: {fault}"
+                "cannot store the description of a component in the graph: {fault}"
             );
         }
         taken.is_ok()
@@ -249,7 +249,7 @@ impl Cell {
             if let Err(fault) = self.knowledge.remove(&source) {
                 error!(
                     component = component.name,
-                    "a component that is gone stays in the graph: {fault}"
+                    "cannot remove a lost component from the graph: {fault}"
                 );
             }
             info!(component = component.name, "a component is gone: {why}");
@@ -397,7 +397,7 @@ impl Plant for Cell {
             if let Err(fault) = self.knowledge.remove(&Source::new(SourceKind::Run, &gone)) {
                 error!(
                     run = gone,
-                    "a run that is too old stays in the graph: {fault}"
+                    "cannot remove an old run from the graph: {fault}"
                 );
             }
         }
@@ -406,7 +406,7 @@ impl Plant for Cell {
             &run.triples(),
             (run.started_ms, Lasting::Yes),
         ) {
-            error!(run = run.run, "a run is not taken into the graph: {fault}");
+            error!(run = run.run, "cannot store a run in the graph: {fault}");
         }
     }
 

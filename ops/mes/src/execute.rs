@@ -215,7 +215,7 @@ impl Execution<'_> {
                 // The step whose end is unknown may go on; no other component repeats it.
                 Ended::Broken(why) if self.log.run().is_unknown() => return Err(why),
                 Ended::Broken(why) => {
-                    warn!(plan = number, "a plan broke: {why}");
+                    warn!(plan = number, "a plan failed: {why}");
                     last = why;
                 }
             }
@@ -316,7 +316,9 @@ impl Execution<'_> {
         drop(roles);
         // A lost component does not respond to the close.
         if tokio::time::timeout(CLOSE, opened.close()).await.is_err() {
-            warn!("the components of a plan were not given back in time");
+            warn!(
+                "the components of a plan were not released in time; they stay reserved until their sessions end"
+            );
         }
         ended
     }

@@ -56,7 +56,7 @@ async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
     if only_loopback && !is_loopback(&known.url) {
         warn!(
             url = known.url,
-            "a server that is not on loopback is left alone; say --interface to look there"
+            "ignored a server that is not on loopback; give --interface to connect to servers of other hosts"
         );
         return;
     }

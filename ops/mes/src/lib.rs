@@ -255,12 +255,14 @@ impl UaMes {
                         info!(findings, "SIGHUP: the sources of {name} were read again");
                     }
                     Err(why) => {
-                        warn!("SIGHUP: the sources stay as they are: {why}");
+                        warn!(
+                            "SIGHUP: cannot read the sources, and the previous sources stay in use: {why}"
+                        );
                         sources.yaml(&name, Some(why));
                     }
                 });
                 if let Err(error) = read.await {
-                    error!("SIGHUP: the sources were not read: {error}");
+                    error!("SIGHUP: cannot read the sources: {error}");
                 }
             }
         })
@@ -529,7 +531,7 @@ async fn run_process(skill: Skill, iri: String) {
     let parameters = vec![("ProcessIri".to_owned(), Value::String(iri.clone()))];
     // The run itself logs its end.
     if let Err(fault) = run.run(parameters, RUN).await {
-        error!(process = iri, "the process was not run: {fault}");
+        error!(process = iri, "cannot run the process: {fault}");
     }
 }
 

@@ -136,7 +136,7 @@ pub(crate) async fn module(
             let (module, services) = (&module.name, services.len());
             warn!(
                 module,
-                services, "services without an endpoint are not watched"
+                services, "cannot monitor services without an endpoint"
             );
         }
         let has_one = all.len() == 1;

@@ -84,7 +84,7 @@ impl Callers {
         if is_current && client.namespaces() == self.client.namespaces() {
             return Ok(client);
         }
-        let another = "the server was started again".to_owned();
+        let another = "the server was restarted".to_owned();
         Err(ClientError::NotConnected(another))
     }
 

@@ -21,27 +21,29 @@ use crate::{StationSettings, Upper};
 
 /// One level of a plant: the discovery server of a workstation and its devices, or of a whole cell.
 ///
-/// Servers of the level below register here as with ua-lds, are told their place (their method `Configure` is called), and
-/// are hidden from the level above: there the station shows their methods as its own, below Devices, and passes calls on.
-/// To the devices it shows the methods of its neighbours above, below Neighbours. Without --upper-interface it is the top
-/// level, and shows nothing to anybody.
+/// Servers of the level below register here as at ua-lds, receive their location (the station calls
+/// their method `Configure`), and are hidden from the level above: there the station shows their
+/// methods as its own, below Devices, and forwards calls. It shows the methods of its neighbours
+/// above to the devices, below Neighbours. Without --upper-interface it is the top level and shows
+/// no methods.
 #[derive(Debug, clap::Parser)]
 #[command(name = "ua-station", version = plant_opcua::patches::version())]
 struct UaStation {
-    /// What it is called on the level above
+    /// The name of the station on the level above
     #[arg(long, value_name = "NAME", env = "UA_STATION")]
     name: String,
-    /// The place of the level in the plant, as plant/cell-1; the level above may say another
+    /// The location of the level in the plant, such as plant/cell-1; the level above may change it
     #[arg(long, value_name = "PLACE", env = "UA_PLACE")]
     place: Option<Place>,
-    /// Where servers of the level below register and clients ask
+    /// The endpoint URL for servers and clients of the level below
     #[arg(long, value_name = "URL", env = "UA_LDS_ENDPOINT", default_value = DEFAULT_LDS)]
     endpoint: String,
-    /// The network interface of the level below, by name or address. Without it only this host is told and heard
+    /// The network interface of the level below, by name or address. Default: only this host
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     interface: Option<String>,
-    /// Networks behind routers whose servers are accepted too, as 10.77.0.0/16. Without it only servers with addresses in the
-    /// subnets of the interface are, since anyone on the network can announce any address
+    /// Networks behind routers with servers that are also accepted, such as 10.77.0.0/16. Default:
+    /// only servers with addresses in the subnets of the interface, because any host can announce
+    /// any address
     #[arg(
         long = "network",
         value_name = "CIDR",
@@ -49,17 +51,20 @@ struct UaStation {
         value_delimiter = ','
     )]
     networks: Vec<discovery::scan::Range>,
-    /// Where the methods of neighbours are called by devices; any port of the interface without it
+    /// The endpoint URL for calls of devices to methods of neighbours. Default: a free port of the
+    /// interface
     #[arg(long, value_name = "URL")]
     devices_endpoint: Option<EndpointUrl>,
     /// The network interface of the level above, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_UPPER_INTERFACE")]
     upper_interface: Option<String>,
-    /// Where the methods of devices are called from above; any port of the upper interface without it
+    /// The endpoint URL for calls from above to methods of devices. Default: a free port of the
+    /// upper interface
     #[arg(long, value_name = "URL", requires = "upper_interface")]
     upper_endpoint: Option<EndpointUrl>,
-    /// The discovery server above: an opc.tcp:// URL, `any` (the only one there), uri=<ApplicationUri>, name=<mDNS name>
-    /// (both may end with *), or node=<NodeId> for the one that has a node, as node=nsu=urn:cell;s=Marker
+    /// The discovery server above: an opc.tcp:// URL, `any` (the only one found),
+    /// uri=<ApplicationUri>, name=<mDNS name> (both may end with *), or node=<NodeId> for the
+    /// server with this node, such as node=nsu=urn:cell;s=Marker
     #[arg(
         long,
         value_name = "CHOICE",
@@ -67,11 +72,12 @@ struct UaStation {
         env = "UA_UPPER_LDS"
     )]
     upper_lds: Choice,
-    /// Serve and use channels that are not secured, too. Without --pki there are no others, and without this option servers
-    /// of other hosts cannot register then
+    /// Also serve and use unsecured channels. Without --pki all channels are unsecured, and servers
+    /// of other hosts need this option to register
     #[arg(long)]
     allow_unsecured: bool,
-    /// How often servers are expected to register, in seconds. A registration without semaphore file counts twice as long
+    /// Expected registration period of servers, in seconds. A registration without semaphore file
+    /// is valid for two periods
     #[arg(long, value_name = "SECONDS", default_value = "600", value_parser = clap::value_parser!(u32).range(1..=86_400))]
     register_period: u32,
     /// The certificate store, for secured channels (Basic256Sha256): own, private, trusted and rejected under one directory
@@ -82,21 +88,22 @@ struct UaStation {
     /// Trust every certificate. For tests and demonstrations only
     #[arg(long, requires = "pki")]
     trust_any_certificate: bool,
-    /// The roles of callers without a user name: observer, operator, engineer, several with commas between them. Calls of
-    /// operators and engineers are passed on, and those of servers of the level, known by their certificates. Users are in
-    /// `users` of --pki (`ua-server user add`). Without it observer, and operator where channels are not secured
+    /// The roles of anonymous callers: observer, operator, engineer, separated by commas. Calls of
+    /// operators and engineers are forwarded, and calls of servers of the level, which are
+    /// identified by their certificates. Users are in `users` of --pki (`ua-server user add`).
+    /// Default: observer, or operator if channels are unsecured
     #[arg(long, value_name = "ROLES", env = "UA_ANONYMOUS")]
     anonymous: Option<Roles>,
-    /// Refuse servers at hosts that their trusted certificates do not name, as after another lease of DHCP. Without it the station
-    /// connects to them and logs a warning
+    /// Refuse servers whose trusted certificates do not include the host of the URL, as after a new
+    /// DHCP lease. Default: the station connects to them and logs a warning
     #[arg(long)]
     refuse_other_hosts: bool,
     #[command(flatten)]
     limits: LimitArguments,
-    /// Serve what is known at this address: /status as JSON, /metrics for Prometheus, and /readyz
+    /// Serve the status at this address: /status as JSON, /metrics for Prometheus, and /readyz
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     metrics: Option<SocketAddr>,
-    /// How log lines look
+    /// The format of the log
     #[arg(
         long,
         value_name = "FORMAT",

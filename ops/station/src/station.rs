@@ -365,7 +365,8 @@ fn endpoint(
     }
     let address = interface.addresses().into_iter().next().ok_or_else(|| {
         let message = format!(
-            "the interface {interface} has no IPv4 address to listen at: give it one, or say {option}"
+            "the interface {interface} has no IPv4 address to listen at: give the interface an address, or \
+             give {option}"
         );
         Failure::new(FailureKind::Unavailable, message)
     })?;
@@ -611,7 +612,7 @@ impl Tended {
             }
         }
         if self.tasks.len() >= MOST_TENDED {
-            warn!("{MOST_TENDED} servers are tended on a level, and there is no room for more");
+            warn!("the limit of {MOST_TENDED} supervised servers of a level is reached");
         }
     }
 }

@@ -80,7 +80,9 @@ impl Tending {
                         self.connected(&of, &mut place, &mut link).await;
                         continue;
                     }
-                    let fault = format!("it is {application_uri}, and said to be another");
+                    let fault = format!(
+                        "its ApplicationUri is {application_uri}, but another was announced"
+                    );
                     self.fault(&url, "refused", fault);
                 }
                 Link::Down {
@@ -224,7 +226,7 @@ impl Tending {
             name = of.name,
             url = of.url,
             methods,
-            "its methods are shown"
+            "showing the methods of a server"
         );
     }
 
@@ -232,7 +234,7 @@ impl Tending {
     fn answers_again(&self, of: &Connected<'_>) {
         self.board.note(self.level, of.url, |peer| {
             if peer.state == BUSY {
-                info!(name = peer.name, url = of.url, "answers again");
+                info!(name = peer.name, url = of.url, "the server responds again");
                 peer.state = CONNECTED;
                 peer.fault = None;
             }
@@ -297,12 +299,12 @@ impl Tending {
                 true
             }
             Err(error @ CallError::Refused { .. }) => {
-                self.note_fault(of, format!("not configured: {error}"));
+                self.note_fault(of, format!("cannot configure it: {error}"));
                 false
             }
             // The connection is lost: the server is configured after the reconnection.
             Err(error @ CallError::Client(_)) => {
-                self.note_fault(of, format!("not configured: {error}"));
+                self.note_fault(of, format!("cannot configure it: {error}"));
                 false
             }
         }
@@ -359,7 +361,7 @@ struct Connected<'a> {
 
 /// The fault of a server that is probably executing a method.
 const ANSWERS_NOTHING: &str =
-    "it answers no requests, and its host is reachable: it may execute a method";
+    "it does not respond, but its host is reachable: it may be executing a method";
 const ASK_LIMIT: Duration = Duration::from_secs(2);
 /// Publishing interval of the subscription to model changes.
 const TOLD_EVERY: Duration = Duration::from_millis(50);

@@ -55,7 +55,7 @@ fn is_genuine(context: &RequestContext) -> bool {
         warn!(
             said = ?said.as_ref(),
             thumbprint = certificate.thumbprint().as_hex_string(),
-            "a client is refused: its certificate is not that of the application it says it is"
+            "rejected a client: its certificate has another ApplicationUri than the client announces"
         );
     }
     genuine

@@ -42,7 +42,7 @@ impl ArgumentTypes {
                         .filter(|(known, of)| *known == structure && !of.contains(&topic))
                         .for_each(|(_, of)| of.push(topic));
                 } else if self.has_other(&structure) || self.of_calls.len() >= MOST_TYPES {
-                    warn!(%topic, name = structure.name, "another DataType has that name, or there are too many: arguments with it stay undefined");
+                    warn!(%topic, name = structure.name, "cannot define the DataType of an argument: another DataType has its name, or the limit of DataTypes is reached");
                 } else {
                     structure.insert(address_space);
                     self.of_calls.push((structure, vec![topic]));

@@ -111,8 +111,7 @@ impl Arrivals {
                 warn!(
                     %topic,
                     spaces = spaces.join(", "),
-                    "a write is not confirmed, and it is unknown whether it has arrived: the bridge of the space, or a \
-                     subscriber there, is missing"
+                    "a write is not confirmed, and its outcome is unknown: the bridge of the space or its subscriber is missing"
                 );
                 StatusCode::BadTimeout
             }

@@ -123,7 +123,7 @@ pub(crate) fn door(
 ) -> Result<(Standing, TcpListener, ServerBuilder), Failure> {
     let builder = builder.trust_client_certs(trust_any);
     let wanted = if trust_any {
-        warn!("every client certificate is trusted, and kept as trusted: for tests only");
+        warn!("this server trusts and stores every client certificate: use this for tests only");
         None
     } else {
         Door::of(pki.root(), clients, UnknownClients::Refuse).map_err(io_fault)?

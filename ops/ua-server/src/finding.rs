@@ -193,7 +193,7 @@ impl Finding {
                 warn!(
                     url,
                     most = MOST_HEARD,
-                    "more servers are heard of than are looked at for skills: this one and others are left out, which is told once"
+                    "the limit of servers that are searched for skills is reached: ignored this server, and will ignore others without a log entry"
                 );
             }
             return;
@@ -374,7 +374,7 @@ impl Finding {
                         uri,
                         url = %access.endpoint,
                         most = wanted.most,
-                        "a server is found that has no place in the space any more: server.find_skills.most"
+                        "ignored a found server: the limit of server.find_skills.most is reached; raise it in the mapping"
                     );
                 }
                 continue;

@@ -111,7 +111,7 @@ impl Methods {
         }
         let node = self.node(topic);
         let Some(around) = self.insert(&node, (topic, description)) else {
-            warn!(%topic, %node, "the call is shown as no Method: there is a node of that id already, which is none, or has other arguments");
+            warn!(%topic, %node, "cannot show the call as a Method: its NodeId belongs to another node, or to a Method with other arguments");
             self.refused.insert(topic, Arc::clone(description));
             return;
         };
@@ -125,7 +125,9 @@ impl Methods {
 
     fn tell_full(&mut self) {
         if !std::mem::replace(&mut self.told_full, true) {
-            warn!("more than {MOST_METHODS} calls of the space: the rest is shown as no Methods");
+            warn!(
+                "more than {MOST_METHODS} calls of the space: the others are not shown as Methods"
+            );
         }
     }
 

@@ -494,8 +494,7 @@ impl SpaceNodes {
         if 10_u64.pow(total.ilog10()) == total {
             warn!(
                 total,
-                "a client gets {status} in place of a value that takes up {} MiB for it; an IndexRange of fewer \
-                 elements can be read",
+                "a client receives {status} instead of a value of {} MiB, which exceeds its limit; it can read fewer elements with an IndexRange",
                 weight >> 20
             );
         }

@@ -179,7 +179,7 @@ impl Loaded {
             return false;
         }
         let Some(NodeType::Variable(variable)) = address_space.find_mut(&topic.node) else {
-            warn!(node = %topic.node, topic = %topic.topic, "the node is no Variable of its NodeSet, so nothing is shown");
+            warn!(node = %topic.node, topic = %topic.topic, "cannot show the value: the node is not a Variable in its NodeSet");
             return true;
         };
         let mut before = Before {

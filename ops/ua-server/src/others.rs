@@ -44,7 +44,7 @@ impl Others {
         };
         if mapping.server().find_skills.is_some() && told.is_none() {
             warn!(
-                "no server is found for server.find_skills: ua-server hears of none without --announce or --lds"
+                "server.find_skills has no effect: give --announce or --lds, so that ua-server discovers other servers"
             );
         }
         others.follow();

@@ -470,7 +470,7 @@ impl Port for ServerPort {
         if let Some(serving) = &mut self.serving
             && tokio::time::timeout(SHUTDOWN, serving).await.is_err()
         {
-            warn!("clients kept their connections; they are dropped");
+            warn!("dropped the connections that clients did not close in time");
         }
         if let Some(runtime) = self.runtime.take() {
             runtime.shutdown_background();
@@ -608,13 +608,12 @@ fn listen(
 fn tell_open(url: &EndpointUrl, described: &Server, security: &[Security]) {
     if security.contains(&Security::None) {
         warn!(
-            "what is said with {url} can be read and changed on the way: server.security has None"
+            "messages of {url} can be read and changed on the network: remove None from server.security"
         );
     }
     match described.anonymous {
         Anonymous::Has(Role::Operator | Role::Engineer) => warn!(
-            "whoever reaches {url} can call what programs of this host execute, whether it is open or not, and write what \
-             the server produces: server.anonymous"
+            "anonymous clients of {url} can write values and call all calls that programs of this host execute: restrict server.anonymous to observer"
         ),
         Anonymous::Usual
         | Anonymous::Refused

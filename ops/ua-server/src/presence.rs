@@ -104,7 +104,9 @@ impl Presence {
                 received: now().utc,
                 latched_by: None,
             }),
-            Err(status) => warn!(name = known.name, %status, "a server cannot be told of"),
+            Err(status) => {
+                warn!(name = known.name, %status, "cannot publish the presence of a server")
+            }
         }
         Some(topic)
     }
@@ -161,7 +163,7 @@ impl Presence {
         let next = (FIRST_GIVEN..=u16::MAX).nth(self.given.len());
         if next.is_none() && !std::mem::replace(&mut self.told_full, true) {
             warn!(
-                "more servers were heard of than there are names for: the others are not told of in the space"
+                "the limit of servers with a presence in the space is reached: the presence of others is not published"
             );
         }
         self.given.insert(own.to_owned(), next?);

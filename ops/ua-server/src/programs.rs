@@ -90,7 +90,9 @@ impl Programs {
         };
         if self.parts.len() >= MOST_PARTS {
             if !std::mem::replace(&mut self.told_full, true) {
-                warn!("more than {MOST_PARTS} calls of actions: the rest is shown as no Programs");
+                warn!(
+                    "more than {MOST_PARTS} calls of actions: the others are not shown as Programs"
+                );
             }
             return;
         }

@@ -162,7 +162,7 @@ impl Sks {
             Err(status) => {
                 warn!(
                     group = format_args!("{group:.128}"),
-                    application, user, "keys of a secured group are refused with {status}"
+                    application, user, "refused the keys of a secured group with {status}"
                 );
                 Err(status.into())
             }
@@ -250,7 +250,9 @@ impl State {
     ) -> Option<(SecurityPolicy, Handed)> {
         let now = now();
         if let Err(error) = self.renew(now) {
-            warn!("{error}; there are no new keys of secured groups, and the last go on");
+            warn!(
+                "{error}; cannot renew the keys of secured groups, and the previous keys stay in use"
+            );
         }
         let group = self.groups.get(group)?;
         let handed = group.ring.hand_out(starting, count, now.monotonic)?;

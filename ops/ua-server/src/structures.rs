@@ -101,8 +101,7 @@ impl Structures {
         };
         if let Some(other) = found.iter().find(other) {
             warn!(
-                "{} is defined in two ways among the variables of namespace {namespace}: the DataType of {name} is \
-                 left open for some",
+                "variables of namespace {namespace} define {} differently: some of them do not get the DataType of {name}",
                 other.name
             );
             return None;

@@ -457,7 +457,8 @@ impl Telling {
         let embed = self.settings.embed;
         Some(Box::pin(async move {
             if embed && same_port(&lds, &server.url) {
-                let message = format!("the server itself is at {lds}; give it another endpoint");
+                let message =
+                    format!("the server itself listens at {lds}; give it another endpoint");
                 return Err(AskFault::Embed(message));
             }
             let server = reachable(server, &lds, interface.as_ref()).await;
@@ -527,9 +528,9 @@ impl Telling {
                             error,
                             AskFault::Refused(_) | AskFault::Certificate(_) | AskFault::Embed(_)
                         ) {
-                            warn!(lds, "not registered: {fault}");
+                            warn!(lds, "cannot register at the discovery server: {fault}");
                         } else {
-                            info!(lds, "not registered yet: {fault}");
+                            info!(lds, "not registered at the discovery server yet: {fault}");
                         }
                         state.fault = Some(fault);
                     }

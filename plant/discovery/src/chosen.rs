@@ -131,13 +131,13 @@ impl Finding {
     fn tell(&self, chosen: &Chosen) {
         let choice = &self.choice;
         let message = match chosen {
-            Chosen::Nobody => "no discovery server is there".to_owned(),
-            Chosen::At(url) => format!("the discovery server is found at {url}"),
+            Chosen::Nobody => "no discovery server found".to_owned(),
+            Chosen::At(url) => format!("found the discovery server at {url}"),
             Chosen::Several(names) => {
                 let names = names.join(", ");
                 warn!(
                     %choice,
-                    "several discovery servers are there, and none is registered with: {names}; say which, as name=..."
+                    "not registered, because several discovery servers were found: {names}; choose with name=..."
                 );
                 return;
             }

@@ -2,7 +2,7 @@
 
 #![expect(
     clippy::wildcard_enum_match_arm,
-    reason = "of the messages of all services some are those of discovery"
+    reason = "discovery uses some of the messages of all services"
 )]
 
 use std::path::Path;
@@ -37,13 +37,13 @@ use mdns::Url;
 #[non_exhaustive]
 pub enum AskFault {
     /// The URL is not an OPC UA URL over TCP.
-    #[error("{0} is no URL as opc.tcp://host:port")]
+    #[error("{0} is not a URL such as opc.tcp://host:port")]
     Url(String),
     /// The server is not reachable.
     #[error("{0}")]
     Connect(#[from] std::io::Error),
     /// The server did not answer in time.
-    #[error("no answer in {0:?}")]
+    #[error("no response within {0:?}")]
     Late(Duration),
     /// The server refused the request with this StatusCode.
     #[error("refused: {0}")]
@@ -55,7 +55,7 @@ pub enum AskFault {
     #[error("{0}")]
     Protocol(String),
     /// No discovery server is reachable, and embedding a discovery server failed.
-    #[error("no discovery server is there, and none can be embedded: {0}")]
+    #[error("no discovery server runs, and this program cannot start one: {0}")]
     Embed(String),
 }
 
@@ -558,7 +558,7 @@ fn header() -> RequestHeader {
 
 fn unexpected(answer: &ResponseMessage) -> AskFault {
     AskFault::Protocol(format!(
-        "{} is no answer to what was asked",
+        "{} is not a response to this request",
         answer.type_name()
     ))
 }

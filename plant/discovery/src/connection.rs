@@ -3,7 +3,7 @@
 
 #![expect(
     clippy::wildcard_enum_match_arm,
-    reason = "of the messages of all services some are those of discovery"
+    reason = "discovery uses some of the messages of all services"
 )]
 
 use std::net::SocketAddr;
@@ -337,7 +337,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             if nonce.as_ref() == channel.remote_nonce() {
                 return Err(bad(
                     StatusCode::BadNonceInvalid,
-                    "the nonce is that of before",
+                    "the nonce was used before",
                 ));
             }
             let taken = channel
@@ -391,7 +391,7 @@ fn admit(header: &AsymmetricSecurityHeader, shared: &Shared) -> Result<(), Statu
 
 const LATE: WireFault = WireFault::Bad {
     status: StatusCode::BadTimeout,
-    what: "nothing came in time",
+    what: "nothing was received in time",
 };
 const HELLO_LIMIT: Duration = Duration::from_secs(5);
 /// Timeout until a channel is open.

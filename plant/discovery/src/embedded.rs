@@ -72,7 +72,7 @@ impl Embedding {
         };
         info!(
             lds = at,
-            "no discovery server is there: it is in this program from now on"
+            "no discovery server runs: this program is the discovery server now"
         );
         let started = Lds::start(&settings, listening).await;
         let (mut lds, questions) = started.map_err(|fault| AskFault::Embed(fault.to_string()))?;

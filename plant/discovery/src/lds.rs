@@ -342,7 +342,7 @@ impl Lds {
         let addresses = settings.interface.addresses();
         if addresses.is_empty() {
             warn!(
-                "the interface {} has no IPv4 address: nobody is heard there until it has one",
+                "the interface {} has no IPv4 address: no server is found there until it has an address",
                 settings.interface
             );
         }
@@ -382,7 +382,7 @@ impl Lds {
             let enrolment = Enrolment::new(root, applicant, gds.clone());
             accepting.spawn(enrolment.keep(bridge_node::restart));
         }
-        info!(url, interface = %settings.interface, "ua-lds listens");
+        info!(url, interface = %settings.interface, "the discovery server is listening");
         let registry = Settings {
             allow_unsecured: settings.allow_unsecured,
             forget_after: settings.register_every * 2,
@@ -456,7 +456,7 @@ impl Lds {
                 info!(
                     url,
                     started_ms = clock::millis(clock::of_ticks(started)),
-                    "it says when it started"
+                    "received the start time of a server"
                 );
             }
         }
@@ -496,7 +496,7 @@ impl Lds {
                         let (uri, why) = (cut(&uri), cut(&fault.to_string()));
                         let what = format!("{uri} {why}");
                         if let Some(untold) = self.refused.admit(&what, clock::now()) {
-                            warn!(?uri, untold, "a registration is refused: {why}");
+                            warn!(?uri, untold, "refused a registration: {why}");
                         }
                         Answer::Refused(fault.status())
                     }
@@ -507,7 +507,7 @@ impl Lds {
 
     #[expect(
         clippy::wildcard_enum_match_arm,
-        reason = "what is to be announced has been by then"
+        reason = "everything is announced by then"
     )]
     fn take(&mut self, event: Event) {
         match event {
@@ -713,8 +713,9 @@ impl ListenFault {
     async fn told(self, endpoint: &str) -> Failure {
         let error = match &self {
             Self::Url => {
-                let message =
-                    format!("--endpoint {endpoint}: for example opc.tcp://127.0.0.1:4840");
+                let message = format!(
+                    "--endpoint {endpoint}: expected a URL such as opc.tcp://127.0.0.1:4840"
+                );
                 return Failure::new(FailureKind::Usage, message);
             }
             Self::AsPublished(error) => {
@@ -729,7 +730,8 @@ impl ListenFault {
         let who = who.and_then(|all| all.into_iter().find(|one| one.is_discovery_server));
         let what = match who {
             Some(one) => format!(
-                "the discovery server \"{}\" ({}) serves there: end it, or the program it is in, or give another --endpoint",
+                "the discovery server \"{}\" ({}) already listens there: stop it or the program that \
+                 contains it, or give another --endpoint",
                 cut(&one.name),
                 cut(&one.application_uri)
             ),
@@ -745,7 +747,7 @@ impl ListenFault {
 impl std::fmt::Display for ListenFault {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::Url => f.write_str("that is no URL as opc.tcp://host:port"),
+            Self::Url => f.write_str("expected a URL such as opc.tcp://host:port"),
             Self::Io(error) => error.fmt(f),
             Self::AsPublished(error) => error.fmt(f),
         }

@@ -108,7 +108,7 @@ impl Line {
 
 #[expect(
     clippy::wildcard_enum_match_arm,
-    reason = "there are many ways to fail, and few say something of the server"
+    reason = "few of the many errors concern the server"
 )]
 async fn connect(place: &Url, until: Instant) -> Result<TcpStream, Reached> {
     let looked_up = timeout_at(until, lookup_host((place.host.as_str(), place.port))).await;
@@ -149,7 +149,7 @@ async fn greet(conversation: &mut Conversation<TcpStream>, url: &str) -> Result<
 
 #[expect(
     clippy::wildcard_enum_match_arm,
-    reason = "of the messages of all services one opens a channel"
+    reason = "one message of all services opens a channel"
 )]
 async fn open(mut conversation: Conversation<TcpStream>, url: &str) -> Option<Line> {
     let request = OpenSecureChannelRequest {

@@ -40,7 +40,7 @@ impl Security {
     ) -> Result<Self, Failure> {
         let failed = |what: &dyn std::fmt::Display| {
             let message = format!(
-                "the certificate store {} cannot be used: {what}",
+                "cannot use the certificate store {}: {what}",
                 root.display()
             );
             Failure::new(FailureKind::Io, message)
@@ -99,7 +99,7 @@ impl Security {
         };
         let told = refused.to_string();
         if let Some(untold) = self.refused.lock().admit(&told, clock::now()) {
-            warn!(untold, "a client is not talked to: {told}");
+            warn!(untold, "rejected a client: {told}");
         }
         // An untrusted client does not learn which check failed (OPC 10000-4, 6.1.3).
         match refused.may_be_told {

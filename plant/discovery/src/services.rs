@@ -2,7 +2,7 @@
 
 #![expect(
     clippy::wildcard_enum_match_arm,
-    reason = "of the messages of all services some are those of discovery"
+    reason = "discovery uses some of the messages of all services"
 )]
 
 use std::path::Path;

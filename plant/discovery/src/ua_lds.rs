@@ -14,22 +14,23 @@ use crate::lds::{self, LdsSettings};
 use crate::scan::Range;
 use crate::{DEFAULT_LDS, Interface};
 
-/// Tells who is there: a Local Discovery Server with multicast extension.
+/// A Local Discovery Server with multicast extension: lists the OPC UA servers of the network.
 ///
-/// Servers register with it (RegisterServer, RegisterServer2) and are announced on the network by mDNS; clients ask it
-/// (FindServers, FindServersOnNetwork, GetEndpoints). There are no sessions. Who does not answer any more is forgotten
-/// within two seconds.
+/// Servers register with it (RegisterServer, RegisterServer2) and are announced on the network by
+/// mDNS; clients query it (FindServers, FindServersOnNetwork, GetEndpoints). It has no sessions. A
+/// server that no longer responds is removed within two seconds.
 #[derive(Debug, clap::Parser)]
 #[command(name = "ua-lds", version = plant_opcua::patches::version())]
 struct UaLds {
-    /// Where servers and clients connect
+    /// The endpoint URL for servers and clients
     #[arg(long, value_name = "URL", env = "UA_LDS_ENDPOINT", default_value = DEFAULT_LDS)]
     endpoint: String,
-    /// The network interface of mDNS, by name or address. Without it only this host is told and heard
+    /// The network interface of mDNS, by name or address. Default: only this host
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     interface: Option<String>,
-    /// Networks behind routers whose servers are accepted too, as 10.77.0.0/16. Without it only servers with addresses in the
-    /// subnets of the interface are, since anyone on the network can announce any address
+    /// Networks behind routers with servers that are also accepted, such as 10.77.0.0/16. Default:
+    /// only servers with addresses in the subnets of the interface, because any host can announce
+    /// any address
     #[arg(
         long = "network",
         value_name = "CIDR",
@@ -37,18 +38,19 @@ struct UaLds {
         value_delimiter = ','
     )]
     networks: Vec<Range>,
-    /// Let servers of other hosts register over channels that are not secured. Without it only those of this host may, over
-    /// a loopback address
+    /// Allow servers of other hosts to register over unsecured channels. Default: only servers of
+    /// this host may, over a loopback address
     #[arg(long)]
     allow_unsecured: bool,
-    /// Take registrations over secured channels alone, from this host too
+    /// Accept registrations over secured channels only, also from this host
     #[arg(long, requires = "pki", conflicts_with = "allow_unsecured")]
     secured_only: bool,
-    /// How often servers are expected to register, in seconds. A registration without semaphore file counts twice as long
+    /// Expected registration period of servers, in seconds. A registration without semaphore file
+    /// is valid for two periods
     #[arg(long, value_name = "SECONDS", default_value = "600", value_parser = clap::value_parser!(u32).range(1..=86_400))]
     register_period: u32,
-    /// The certificate store, for secured channels (Basic256Sha256): own, private and trusted under one directory. Without
-    /// it no channel is secured
+    /// The certificate store, for secured channels (Basic256Sha256): own, private and trusted in
+    /// one directory. Default: unsecured channels only
     #[arg(long, value_name = "DIR", env = "UA_LDS_PKI")]
     pki: Option<PathBuf>,
     #[command(flatten)]
@@ -56,11 +58,11 @@ struct UaLds {
     /// Trust every client certificate. For tests and demonstrations only
     #[arg(long, requires = "pki")]
     trust_any_client_certificate: bool,
-    /// Serve what is known at this address: /status as JSON, /metrics for Prometheus, and whether the program can do its
-    /// work: /readyz
+    /// Serve the status at this address: /status as JSON, /metrics for Prometheus, and /readyz for
+    /// readiness
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     metrics: Option<SocketAddr>,
-    /// How log lines look
+    /// The format of the log
     #[arg(
         long,
         value_name = "FORMAT",

@@ -31,7 +31,7 @@ use tracing::subscriber::NoSubscriber;
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum WireFault {
     /// The connection was lost.
-    #[error("the connection broke off: {0}")]
+    #[error("the connection failed: {0}")]
     Io(#[from] io::Error),
     /// The peer closed it.
     #[error("the connection was closed")]
@@ -44,7 +44,7 @@ pub(crate) enum WireFault {
         what: &'static str,
     },
     /// The peer sent an Error message and closes.
-    #[error("the peer says {0}")]
+    #[error("the peer reports {0}")]
     Told(StatusCode),
     /// A message cannot be decoded; the channel stays open.
     #[error("the message cannot be read: {status}")]
@@ -152,7 +152,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             _ => {
                 return Err(WireFault::bad(
                     StatusCode::BadTcpMessageTypeInvalid,
-                    "no type of a message",
+                    "not a message type",
                 ));
             }
         };
@@ -160,14 +160,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         if !whole {
             return Err(WireFault::bad(
                 StatusCode::BadTcpMessageTypeInvalid,
-                "no type of a chunk",
+                "not a chunk type",
             ));
         }
         let size = usize::try_from(u32::from_le_bytes(size)).unwrap_or(usize::MAX);
         if !(HEADER..=MOST_CHUNK).contains(&size) {
             return Err(WireFault::bad(
                 StatusCode::BadTcpMessageTooLarge,
-                "no size of a chunk",
+                "not a chunk size",
             ));
         }
         let mut bytes = BytesMut::zeroed(size);
@@ -191,11 +191,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         if frame.kind != kind {
             return Err(WireFault::bad(
                 StatusCode::BadTcpMessageTypeInvalid,
-                "another greeting was expected",
+                "expected another message of the handshake",
             ));
         }
         decode(&frame.bytes)
-            .map_err(|error| WireFault::of(&error, "a greeting that cannot be read"))
+            .map_err(|error| WireFault::of(&error, "a malformed message of the handshake"))
     }
 
     /// Sends Hello, Acknowledge or Error.
@@ -205,7 +205,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
     ) -> Result<(), WireFault> {
         let mut bytes = Vec::with_capacity(greeting.byte_len());
         let encoded = SimpleBinaryEncodable::encode(greeting, &mut bytes);
-        encoded.map_err(|error| WireFault::of(&error, "a greeting that cannot be written"))?;
+        encoded
+            .map_err(|error| WireFault::of(&error, "cannot encode a message of the handshake"))?;
         self.stream.write_all(&bytes).await?;
         Ok(())
     }
@@ -271,7 +272,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             if chunks.len() > MOST_CHUNKS || size > MOST_HEARD {
                 return Err(WireFault::bad(
                     StatusCode::BadTcpMessageTooLarge,
-                    "a message that is too large",
+                    "the message is too large",
                 ));
             }
             if last == b'F' {
@@ -295,15 +296,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             &self.channel,
             message,
         );
-        let chunks =
-            chunks.map_err(|error| WireFault::of(&error, "a message that cannot be written"))?;
+        let chunks = chunks.map_err(|error| WireFault::of(&error, "cannot encode the message"))?;
         self.sent
             .increment(u32::try_from(chunks.len()).unwrap_or(u32::MAX));
         let mut secured = vec![0; chunk_size + MIN_CHUNK_SIZE];
         for chunk in &chunks {
             let size = self.channel.apply_security(chunk, &mut secured);
             let size =
-                size.map_err(|status| WireFault::bad(status, "a message that cannot be secured"))?;
+                size.map_err(|status| WireFault::bad(status, "cannot secure the message"))?;
             self.stream
                 .write_all(secured.get(..size).unwrap_or_default())
                 .await?;
@@ -327,7 +327,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             true => Ok(()),
             false => Err(WireFault::bad(
                 StatusCode::BadSecurityChecksFailed,
-                "the channel is another's",
+                "the channel belongs to another connection",
             )),
         }
     }
@@ -344,7 +344,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         if id == 0 || number(HEADER) != Some(id) {
             return Err(WireFault::bad(
                 StatusCode::BadTcpSecureChannelUnknown,
-                "no channel of this connection",
+                "not a channel of this connection",
             ));
         }
         // The previous token is valid until a message uses the new token (OPC 10000-4, 5.5.2).
@@ -353,7 +353,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             Some(its) if its == token || its.checked_add(1) == Some(token) => Ok(()),
             _ => Err(WireFault::bad(
                 StatusCode::BadSecureChannelTokenUnknown,
-                "no token of this channel",
+                "not a token of this channel",
             )),
         }
     }
@@ -378,7 +378,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         }));
         let chunk = match verified {
             Ok(chunk) => {
-                chunk.map_err(|error| WireFault::of(&error, "a chunk that does not verify"))?
+                chunk.map_err(|error| WireFault::of(&error, "a chunk with a wrong signature"))?
             }
             Err(_panic) => {
                 return Err(WireFault::bad(
@@ -391,7 +391,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         let info = info.map_err(|error| WireFault::of(&error, "a chunk without its headers"))?;
         let number = info.sequence_header.sequence_number;
         let next = self.heard.validate_and_increment(number);
-        next.map_err(|error| WireFault::of(&error, "a chunk out of its turn"))?;
+        next.map_err(|error| WireFault::of(&error, "a chunk out of sequence"))?;
         Ok(chunk)
     }
 
@@ -438,7 +438,7 @@ fn channel(role: Role) -> SecureChannel {
 fn opening(frame: &[u8]) -> Result<AsymmetricSecurityHeader, WireFault> {
     let rest = frame.get(MESSAGE_CHUNK_HEADER_SIZE..).unwrap_or_default();
     let header = AsymmetricSecurityHeader::decode(&mut Cursor::new(rest), &options());
-    header.map_err(|error| WireFault::of(&error, "a channel that cannot be opened"))
+    header.map_err(|error| WireFault::of(&error, "cannot open the channel"))
 }
 
 fn decode<T: SimpleBinaryDecodable>(bytes: &[u8]) -> Result<T, Error> {

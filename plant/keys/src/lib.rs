@@ -19,11 +19,11 @@ use tracing::warn;
 
 pub use plant_opcua::QUIET;
 
-/// What the command line of a program says about how it fetches keys.
+/// The command line options for fetching keys.
 #[derive(Debug, Clone, Default, PartialEq, Eq, clap::Args)]
 pub struct KeyArguments {
-    /// The certificate store for sessions with a Security Key Service: own, private, trusted and rejected under one
-    /// directory
+    /// The certificate store for sessions with a Security Key Service: own, private, trusted and
+    /// rejected in one directory
     #[arg(long, value_name = "DIR", env = "UA_PKI")]
     pub pki: Option<PathBuf>,
 }
@@ -89,7 +89,7 @@ impl Service {
         let started = std::thread::Builder::new()
             .name("keys".to_owned())
             .spawn(move || serve(&identity, requests));
-        started.map_err(|error| format!("no thread to fetch in: {error}"))?;
+        started.map_err(|error| format!("cannot start the thread that fetches keys: {error}"))?;
         *asked = Some(sender.clone());
         Ok(sender)
     }
@@ -110,7 +110,7 @@ impl KeyService for Service {
             let (answer, answered) = oneshot::channel();
             let request = request.clone();
             let asked = Asked { request, answer };
-            let gone = || "the thread that fetches has ended".to_owned();
+            let gone = || "the thread that fetches keys has ended".to_owned();
             thread.send(asked).await.map_err(|_| gone())?;
             answered.await.map_err(|_| gone())?
         })
@@ -167,7 +167,8 @@ async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, Str
         };
         let called = client.call_within((&object, &method), arguments, options);
         let outputs = called.await.map_err(|error| told(&error, request))?;
-        answer(outputs).ok_or_else(|| "its answer is not that of GetSecurityKeys".to_owned())
+        answer(outputs)
+            .ok_or_else(|| "its response is not a response to GetSecurityKeys".to_owned())
     };
     let fetched = asked.await;
     client.close().await;
@@ -179,12 +180,12 @@ fn told(error: &CallError, request: &KeyRequest) -> String {
     match error {
         CallError::Refused { status, .. } if *status == StatusCode::BadUserAccessDenied => {
             format!(
-                "this program is none of those that get the keys of `{}`",
+                "this program is not allowed to get the keys of `{}`: add its ApplicationUri to `members` of the group",
                 request.group
             )
         }
         CallError::Refused { status, .. } if *status == StatusCode::BadNotFound => {
-            format!("it knows no group `{}`", request.group)
+            format!("the service has no group `{}`", request.group)
         }
         CallError::Refused { .. } | CallError::Client(_) => error.to_string(),
     }

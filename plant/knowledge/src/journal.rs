@@ -146,7 +146,7 @@ impl Journal {
             && let Err(error) = self.shrink()
         {
             // The records are on the disk.
-            tracing::warn!(%error, "cannot write the journal anew");
+            tracing::warn!(%error, "cannot rewrite the journal");
             self.compact = self.length;
         }
         Ok(())

@@ -377,7 +377,7 @@ fn closure(
         if all.len() + seen.len() > MAX_DERIVED {
             tracing::warn!(
                 most = MAX_DERIVED,
-                "the classes have more superclasses than are kept; questions about types miss some"
+                "the limit of stored superclasses is reached: answers about types may be incomplete"
             );
             break;
         }

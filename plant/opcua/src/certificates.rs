@@ -71,7 +71,7 @@ pub enum StoreFault {
         source: io::Error,
     },
     /// The file is not a certificate.
-    #[error("{path} is no certificate: {why}")]
+    #[error("{path} is not a certificate: {why}")]
     Certificate {
         /// The file.
         path: PathBuf,
@@ -79,7 +79,7 @@ pub enum StoreFault {
         why: String,
     },
     /// No connection can use the certificate, so it cannot be trusted.
-    #[error("{path} can never be used: {why}")]
+    #[error("{path} is not usable: {why}")]
     Useless {
         /// The file.
         path: PathBuf,
@@ -88,7 +88,7 @@ pub enum StoreFault {
     },
     /// No certificate has a thumbprint with this prefix.
     #[error(
-        "no {standing} certificate has a thumbprint that begins with `{given}`, and there is no such file"
+        "no {standing} certificate has a thumbprint that begins with `{given}`, and no file has this name"
     )]
     Unknown {
         /// The folder that was searched.
@@ -97,9 +97,7 @@ pub enum StoreFault {
         given: String,
     },
     /// Several certificates have a thumbprint with this prefix.
-    #[error(
-        "several certificates have a thumbprint that begins with `{0}`: give more digits of it"
-    )]
+    #[error("several certificates have a thumbprint that begins with `{0}`: give more digits")]
     Several(String),
 }
 
@@ -254,7 +252,7 @@ fn keep(root: &Path, certificate: &X509, standing: Standing) -> Result<Stored, S
     })?;
     stored(&path, standing).ok_or_else(|| StoreFault::Certificate {
         path,
-        why: "it cannot be read back".to_owned(),
+        why: "the written file cannot be read again".to_owned(),
     })
 }
 
@@ -271,18 +269,18 @@ fn check_use(certificate: &X509, path: &Path) -> Result<(), StoreFault> {
     };
     match certificate.key_bits() {
         None => {
-            let why = "its key is no RSA key, and the security policies of this server need one";
+            let why = "its key is not an RSA key, which the security policies of this server need";
             return Err(useless(why.to_owned()));
         }
         Some(bits) if !(2048..=4096).contains(&bits) => {
             return Err(useless(format!(
-                "its RSA key has {bits} bits, and the security policies of this server need 2048 to 4096"
+                "its RSA key has {bits} bits, but the security policies of this server need 2048 to 4096"
             )));
         }
         Some(_) => {}
     }
     if !certificate.is_authority() && certificate.application_uri().is_none() {
-        let why = "it has no ApplicationUri, which is a URI among its subject alternative names";
+        let why = "it has no ApplicationUri (a URI among its subject alternative names)";
         return Err(useless(why.to_owned()));
     }
     Ok(())
@@ -344,7 +342,7 @@ pub fn keep_issuer(root: &Path, file: &Path) -> Result<Stored, StoreFault> {
     if !is_authority(&certificate) {
         return Err(StoreFault::Certificate {
             path: file.to_owned(),
-            why: "it is not of an authority".to_owned(),
+            why: "it is not the certificate of an authority".to_owned(),
         });
     }
     keep(root, &certificate, Standing::Issuer)

@@ -64,7 +64,7 @@ struct Changed {
 impl Changed {
     fn new(changes: &[ModelChange]) -> Self {
         let now = DateTime::now();
-        let message = format!("{} nodes are others than before", changes.len());
+        let message = format!("{} nodes have changed", changes.len());
         let base = BaseEventType {
             event_id: opcua::crypto::random::byte_string(16),
             event_type: ObjectTypeId::GeneralModelChangeEventType.into(),

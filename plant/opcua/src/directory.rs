@@ -115,10 +115,10 @@ pub enum DirectoryError {
         error: CallError,
     },
     /// The server has no Directory.
-    #[error("the server has no namespace {NAMESPACE}: it is no Global Discovery Server")]
+    #[error("the server has no namespace {NAMESPACE}, so it is not a Global Discovery Server")]
     None,
     /// The response does not conform to the standard.
-    #[error("{0} answers with what OPC 10000-12 does not say")]
+    #[error("the response to {0} does not follow OPC 10000-12")]
     Answer(&'static str),
 }
 
@@ -305,7 +305,7 @@ impl Directory {
             }
             content.extend(bytes);
             if content.len() > LARGEST {
-                break Err(DirectoryError::Answer("a file that is too large"));
+                break Err(DirectoryError::Answer("the file is too large"));
             }
         };
         let closed = call(

@@ -327,7 +327,7 @@ impl Shared {
                 // `Pki::report_rejected` logs the certificate together with the command that trusts
                 // it.
                 if let Err(error) = certificates::keep_refused(&self.root, certificate) {
-                    warn!(%error, "a refused certificate is not kept");
+                    warn!(%error, "cannot store a rejected certificate");
                 }
             } else {
                 self.tell(certificate, fault, peer, "is refused");
@@ -372,7 +372,8 @@ impl Shared {
         if let Some(untold) = self.another(certificate, "chain") {
             warn!(
                 name = ?certificate.name(), %peer, untold,
-                "a client is refused: it sends certificates of authorities along with its own; have it send its own alone"
+                "rejected a client: it sends issuer certificates together with its own; configure it to \
+                 send only its own certificate"
             );
         }
     }

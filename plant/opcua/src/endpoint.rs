@@ -191,8 +191,8 @@ pub enum UrlError {
 pub enum BindError {
     /// Another program uses the port.
     #[error(
-        "another program listens on {address} already (see `ss -ltnp 'sport = :{port}'`); \
-         stop it, or choose another endpoint"
+        "another program already listens on {address} (see `ss -ltnp 'sport = :{port}'`); stop it, or \
+         choose another endpoint"
     )]
     Taken {
         /// Address and port.
@@ -201,7 +201,7 @@ pub enum BindError {
         port: u16,
     },
     /// The address does not belong to this computer.
-    #[error("{0} is no address of this computer; choose one of its own as endpoint")]
+    #[error("{0} is not an address of this host; choose an address of this host for the endpoint")]
     NotOurs(String),
     /// The host cannot be resolved.
     #[error("the host {host} of the endpoint has no address: {source}")]

@@ -150,7 +150,8 @@ impl Judge {
                 status: StatusCode::BadCertificateInvalid,
                 may_be_told: true,
                 name: shown.0.name(),
-                why: "it sends certificates of authorities along with its own; have it send its own alone".to_owned(),
+                why: "it sends issuer certificates together with its own; configure it to send only its own \
+                      certificate".to_owned(),
             });
         }
         Ok(shown)
@@ -217,7 +218,7 @@ impl Judge {
             let kept = certificates::keep_refused(&self.root, certificate);
             let digits = kept.map_or_else(
                 |error| {
-                    debug!(%error, "a refused certificate is not kept");
+                    debug!(%error, "cannot store a rejected certificate");
                     "FILE.der".to_owned()
                 },
                 |kept| kept.thumbprint.chars().take(SHOWN_DIGITS).collect(),
@@ -227,23 +228,24 @@ impl Judge {
         match fault {
             Fault::Untrusted => format!("to trust it: {}", this_one()),
             Fault::Incomplete => format!(
-                "to trust the authority {issuer:?} that issued it: `ua-server trust AUTHORITY.der --pki {pki:?}`, or this \
-                 certificate alone: {}",
+                "to trust its issuer {issuer:?}: `ua-server trust AUTHORITY.der --pki {pki:?}`; to trust \
+                 only this certificate: {}",
                 this_one()
             ),
             Fault::RevocationUnknown => format!(
-                "take up the list of the authority {issuer:?}: `ua-server trust FILE.crl --pki {pki:?}`"
+                "add the revocation list of the authority {issuer:?}: `ua-server trust FILE.crl --pki {pki:?}`"
             ),
             Fault::IssuerRevocationUnknown => format!(
-                "take up the list of the authority above {issuer:?}: `ua-server trust FILE.crl --pki {pki:?}`"
+                "add the revocation list of the issuer of {issuer:?}: `ua-server trust FILE.crl --pki {pki:?}`"
             ),
             Fault::Host => format!(
-                "it is reached at {:?}, and its certificate is for {:?}: reach it by one of these, or have it issued for that host",
+                "its URL has the host {:?}, but its certificate has {:?}: use one of these hosts in the \
+                 URL, or issue a certificate for the host",
                 names.host.unwrap_or_default(),
                 certificate.hosts()
             ),
             Fault::Uri => format!(
-                "it says it is {:?}, and its certificate is of {:?}",
+                "it announces the ApplicationUri {:?}, but its certificate has {:?}",
                 names.application_uri.unwrap_or_default(),
                 certificate.application_uri().unwrap_or_default()
             ),
@@ -264,9 +266,9 @@ pub(crate) const fn help(fault: Fault) -> &'static str {
     match fault {
         Fault::Revoked | Fault::IssuerRevoked => "it needs another certificate",
         Fault::RevocationUnknown | Fault::IssuerRevocationUnknown => {
-            "take up the authority's list: `ua-server trust FILE.crl`"
+            "add the revocation list of the authority: `ua-server trust FILE.crl`"
         }
-        Fault::Time => "it is to be issued anew, or one of the clocks is wrong",
+        Fault::Time => "renew the certificate, or set the clocks of both hosts",
         Fault::IssuerTime => "the authority needs a new certificate",
         Fault::Invalid
         | Fault::Incomplete
@@ -275,7 +277,7 @@ pub(crate) const fn help(fault: Fault) -> &'static str {
         | Fault::Host
         | Fault::Uri
         | Fault::Use
-        | Fault::IssuerUse => "it needs another certificate, as OPC 10000-6, 6.2.2 has it",
+        | Fault::IssuerUse => "it needs another certificate (OPC 10000-6, 6.2.2)",
     }
 }
 

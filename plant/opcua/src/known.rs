@@ -72,9 +72,9 @@ pub fn keep_crl(root: &Path, file: &Path) -> Result<PathBuf, StoreFault> {
         why: why.to_owned(),
     };
     let read = bytes(file).ok_or_else(|| why("it cannot be read, or is too large"))?;
-    let list = Crl::read(&read).map_err(|_| why("it is no revocation list either"))?;
+    let list = Crl::read(&read).map_err(|_| why("it is not a revocation list either"))?;
     put_crl(root, &list)?.ok_or_else(|| {
-        why("it is the revocation list of an authority that is not known here: trust that first")
+        why("it is the revocation list of an unknown authority: trust the authority first")
     })
 }
 
@@ -103,7 +103,7 @@ pub fn put_crl(root: &Path, list: &Crl) -> Result<Option<PathBuf>, StoreFault> {
             continue;
         };
         if of_it.times().0 > list.times().0 {
-            warn!(file = %other.display(), "a newer revocation list of the authority is there already, and stays");
+            warn!(file = %other.display(), "kept the stored revocation list of the authority, which is newer");
             return Ok(Some(other));
         }
         if other != path {

@@ -66,7 +66,7 @@ pub enum NodeSetError {
         reason: String,
     },
     /// The values of some nodes cannot be decoded, for example structures of unknown types.
-    #[error("{file}: {missing} of its {all} nodes cannot be used, for a value that cannot be read")]
+    #[error("{file}: {missing} of its {all} nodes are not usable, because a value cannot be read")]
     Values {
         /// The file.
         file: String,
@@ -89,7 +89,7 @@ pub enum NodeSetError {
         reason: String,
     },
     /// The number of further nodes with values that cannot be decoded.
-    #[error("{file}: the values of {count} more nodes cannot be read")]
+    #[error("{file}: cannot read the values of {count} more nodes")]
     MoreUnread {
         /// The file.
         file: String,
@@ -108,7 +108,7 @@ pub enum NodeSetError {
     #[error("there are more than {MOST_NODESETS} NodeSets")]
     Many,
     /// No file provides a namespace that is required.
-    #[error("{file} needs the namespace {uri}, and no NodeSet given has it")]
+    #[error("{file} needs the namespace {uri}, which no given NodeSet contains")]
     Missing {
         /// The file.
         file: String,
@@ -279,7 +279,7 @@ impl Facts {
             needs.extend(used);
             let resolved = |text: &str| check.id(text).ok();
             if !nodes.insert(id, node, &resolved) {
-                return Err(check.wrong(node, "there are two nodes with this NodeId"));
+                return Err(check.wrong(node, "two nodes have this NodeId"));
             }
         }
         for node in &set.nodes {
@@ -293,7 +293,8 @@ impl Facts {
                 None => false,
             });
             if is_endless {
-                let reason = format!("it has more than {DEEPEST} supertypes, or is one of its own");
+                let reason =
+                    format!("it has more than {DEEPEST} supertypes, or is a supertype of itself");
                 return Err(check.wrong(node, reason));
             }
         }
@@ -446,7 +447,7 @@ impl Check<'_> {
         match self.uri(id.namespace) {
             Some(_) => Ok(id),
             None => Err(format!(
-                "`{text}` has namespace {}, and the table of the file has {}",
+                "`{text}` has namespace {}, but the table of the file has {}",
                 id.namespace,
                 self.uris.len()
             )),

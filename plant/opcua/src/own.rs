@@ -50,11 +50,11 @@ pub enum Cause {
 impl fmt::Display for Cause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            Self::Missing => "there was none",
+            Self::Missing => "no certificate existed",
             Self::KeyMissing => "the key of the previous certificate was missing",
             Self::CertificateMissing => "the certificate of the key was missing",
             Self::EarlyClock => {
-                "the previous certificate was made before the clock was set, and has expired"
+                "the previous certificate was made before the clock was set and has expired"
             }
             Self::Expired => "the previous certificate has expired",
             Self::ApplicationUri => "the previous certificate named another ApplicationUri",

@@ -117,7 +117,7 @@ fn for_owner_alone(path: &Path) -> io::Result<()> {
     }
     match fs::set_permissions(path, fs::Permissions::from_mode(0o600)) {
         Ok(()) => {
-            tracing::info!(key = %path.display(), "the private key can be read by its owner alone");
+            tracing::info!(key = %path.display(), "restricted the private key to its owner");
         }
         Err(error) => {
             tracing::warn!(key = %path.display(), %error, "other users can read the private key: `chmod 600` it");

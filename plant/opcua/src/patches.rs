@@ -17,8 +17,8 @@ pub const SERVE_AS_PUBLISHED: &str = "UA_SERVE_AS_PUBLISHED";
 /// An address that unpatched libraries do not serve.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{library} does not bound what clients take, and serves loopback only, not {0}: build with `cargo xtask build`, which \
-     applies the patches, or set {SERVE_AS_PUBLISHED}=1",
+    "{library} has no limits for clients, so it serves loopback only, not {0}: build with `cargo xtask \
+     build`, which applies the patches, or set {SERVE_AS_PUBLISHED}=1",
     library = library()
 )]
 pub struct OtherHosts(pub SocketAddr);

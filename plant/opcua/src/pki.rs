@@ -25,9 +25,7 @@ pub struct Pki {
 #[derive(Debug, thiserror::Error)]
 pub enum PkiError {
     /// A directory cannot be created or read.
-    #[error(
-        "the certificate store {path} cannot be used: {source}; choose another directory for it"
-    )]
+    #[error("cannot use the certificate store {path}: {source}; choose another directory for it")]
     Directory {
         /// The directory.
         path: PathBuf,
@@ -37,7 +35,7 @@ pub enum PkiError {
     },
     /// Only the certificate or only the key exists. A new pair would silently replace a certificate
     /// that clients trust.
-    #[error("{present} is there but {missing} is not: put it back, or remove both for a new pair")]
+    #[error("{present} exists, but {missing} does not: restore it, or remove both for a new pair")]
     Half {
         /// The existing file.
         present: PathBuf,
@@ -45,13 +43,13 @@ pub enum PkiError {
         missing: PathBuf,
     },
     /// The files exist, but are not a valid certificate and key.
-    #[error("{0}; put back the certificate and its key, or remove both for a new pair")]
+    #[error("{0}; restore the certificate and its key, or remove both for a new pair")]
     Unreadable(String),
     /// A new pair cannot be created or written.
-    #[error("no certificate could be made: {0}")]
+    #[error("cannot make a certificate: {0}")]
     Make(String),
     /// The store has no certificate to renew.
-    #[error("there is no certificate in {0}: the program of the store makes it when it starts")]
+    #[error("no certificate in {0}: start the program that uses this store, which makes it")]
     None(PathBuf),
     /// An authority issued the certificate.
     #[error(
@@ -300,14 +298,14 @@ impl Pki {
     fn tell_refused(&self, path: &Path) {
         let trusted = self.root.join("trusted");
         let Some(stored) = certificates::stored(path, Standing::Rejected) else {
-            warn!("a client was refused, and {path:?} holds no certificate that could be trusted");
+            warn!("rejected a client, and {path:?} contains no certificate that can be trusted");
             return;
         };
         warn!(
             name = ?stored.name,
             application_uri = ?stored.application_uri.unwrap_or_default(),
-            "a client was refused because its certificate is not trusted; to trust it: `ua-server trust {} --pki {:?}`, or \
-             move {path:?} into {trusted:?}",
+            "rejected a client whose certificate is not trusted; to trust it: `ua-server trust {} --pki \
+             {:?}`, or move {path:?} into {trusted:?}",
             stored.thumbprint.get(..16).unwrap_or_default(),
             self.root,
         );
@@ -380,7 +378,7 @@ pub fn know_trusted(root: &Path) {
 
 fn remove(refused: &Path) {
     if let Err(error) = fs::remove_file(refused) {
-        warn!(path = %refused.display(), %error, "an old refused certificate cannot be removed");
+        warn!(path = %refused.display(), %error, "cannot remove an old rejected certificate");
     }
 }
 

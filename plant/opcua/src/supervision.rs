@@ -16,9 +16,9 @@ pub const CONFIGURE: &str = "Configure";
 pub const CONFIGURED: [(&str, &str); 3] = [
     (
         "Place",
-        "Where the component is, as cell-1/station-a/gripper",
+        "The location of the component, such as cell-1/station-a/gripper",
     ),
-    ("SupervisorUri", "The ApplicationUri of whoever says so"),
+    ("SupervisorUri", "The ApplicationUri of the supervisor"),
     (
         "DiscoveryUrl",
         "The discovery server of the component's level",

@@ -148,7 +148,7 @@ async fn a_server_that_says_nothing_more_is_taken_for_down() {
     let Link::Down { reason, .. } = until(&client, is_down).await else {
         panic!()
     };
-    assert!(reason.contains("does not answer"), "{reason}");
+    assert!(reason.contains("does not respond"), "{reason}");
     cut.send_replace(false);
     until(&client, is_up).await;
     relaying.abort();

@@ -80,7 +80,7 @@ pub enum Refused {
 /// The end of a run that is not the current run, for example of a worker that was halted and ends
 /// later.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-#[error("run {run:?} is not the one that runs")]
+#[error("run {run:?} is not the current run")]
 pub struct NotRunning {
     /// The run that ended.
     pub run: RunId,

@@ -210,7 +210,7 @@ impl Actor {
                 skill = self.facts.name,
                 run,
                 why,
-                "component ends with a pending cancellation: the outcome of the run is unknown"
+                "the component stops with a pending cancellation: the outcome of the run is unknown; check the machine"
             );
             self.give_up("the end of the component");
         }
@@ -448,7 +448,7 @@ impl Actor {
         work.task.abort();
         let ended = timeout(TIME_TO_BREAK_OFF, &mut work.task).await;
         let how = format!(
-            "the outcome is unknown: its work had not come to a stand after {TIME_TO_STOP:?} and was broken off"
+            "the outcome is unknown: its work did not stop within {TIME_TO_STOP:?} and was broken off"
         );
         warn!(skill = self.facts.name, "run {}: {how}", work.run.number());
         if ended.is_ok() {

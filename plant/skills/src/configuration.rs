@@ -91,7 +91,7 @@ impl Configuration {
         match stored.map(read) {
             None | Some(Ok(None)) => {}
             Some(Ok(Some(stored))) => configuration.restore(&stored),
-            Some(Err(why)) => tracing::warn!("the stored configuration is not used: {why}"),
+            Some(Err(why)) => tracing::warn!("ignored the stored configuration: {why}"),
         }
         configuration
     }
@@ -168,7 +168,7 @@ impl Configuration {
             };
             match value {
                 Ok(value) => drop(values.insert(name.clone(), value)),
-                Err(why) => tracing::warn!(field = name, "the stored value is not used: {why}"),
+                Err(why) => tracing::warn!(field = name, "ignored a stored value: {why}"),
             }
         }
         self.values.send_replace(Arc::new(values));

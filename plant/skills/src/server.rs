@@ -487,7 +487,7 @@ impl Leases {
         self.server.on_session_closed(move |session| {
             // The queue is longer than the maximum number of sessions of the server.
             if let Err(error) = closed.try_send(session) {
-                tracing::warn!(session, "the end of a session is not taken up: {error}");
+                tracing::warn!(session, "cannot process the end of a session: {error}");
             }
         });
         let mut look = tokio::time::interval((idle / LOOKS).max(SHORTEST_LOOK));

@@ -271,7 +271,11 @@ pub(crate) async fn watch(
         if (has_measured || logged.as_ref() != Some(&why))
             && let Some(untold) = losses.admit(Instant::now().into_std())
         {
-            tracing::warn!(source = sensor.source(), untold, "values are lost: {why}");
+            tracing::warn!(
+                source = sensor.source(),
+                untold,
+                "cannot read a value: {why}"
+            );
             logged = Some(why);
         }
         sleep(pause).await;

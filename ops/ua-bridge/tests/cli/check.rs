@@ -142,7 +142,7 @@ fn each_type_is_told_with_where_it_is_from() {
     let of = |code: &str| findings.iter().find(|one| one["code"] == code).unwrap();
     let message = of("M101")["message"].as_str().unwrap();
     assert!(
-        message.contains("Leg.msg:2: a field name expected"),
+        message.contains("Leg.msg:2: expected a field name"),
         "{message}"
     );
     let help = of("M063")["help"].as_str().unwrap();
@@ -252,7 +252,7 @@ fn a_password_in_a_file_others_can_read_is_told_and_not_shown() {
         assert!(ended.stdout.contains("warning[M114]"), "{}", ended.stdout);
         ended.stdout
     };
-    assert!(told(0o644).contains("everybody on this host can read it"));
+    assert!(told(0o644).contains("every user of this host can read it"));
     assert!(told(0o640).contains("the group of the file can read it"));
     assert!(!told(0o600).contains("can read it"));
     let ended = run_on(&["check", "-"], text.as_bytes());
@@ -302,26 +302,30 @@ fn each_nodeset_that_cannot_be_loaded_is_told_where_it_is_named_and_with_what_to
     };
     let mut wrong = Vec::new();
     for (file, why, help) in [
-        ("away.xml", "No such file", "from the folder of the file"),
-        ("folder.xml", "it is no file", "from the folder of the file"),
-        ("large.xml", "more than 64 MiB", "UANodeSet"),
+        (
+            "away.xml",
+            "No such file",
+            "relative to the folder of the file",
+        ),
+        (
+            "folder.xml",
+            "it is not a file",
+            "relative to the folder of the file",
+        ),
+        ("large.xml", "larger than 64 MiB", "UANodeSet"),
         ("text.xml", "is not a NodeSet2 document", "UANodeSet"),
         ("half.xml", "is not a NodeSet2 document", "UANodeSet"),
         ("other.xml", "is not a NodeSet2 document", "UANodeSet"),
-        (
-            "core.xml",
-            "nodes of the core namespace",
-            "leave the file out",
-        ),
+        ("core.xml", "nodes of the core namespace", "remove the file"),
         (
             "needs.xml",
             "needs the namespace urn:nowhere",
-            "name the NodeSet2 file of that",
+            "add the NodeSet2 file of this",
         ),
         (
             "line.xml, again.xml",
             "both have nodes of the namespace urn:line",
-            "leave one",
+            "remove one",
         ),
     ] {
         let (code, findings) = check(file, &[]);

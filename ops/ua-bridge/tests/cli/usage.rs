@@ -163,15 +163,15 @@ fn json_that_is_no_datagram_is_refused_with_its_place() {
         ),
         (
             field(json!({ "UaType": 26, "Value": 1 })).to_string(),
-            "dataSetMessages[0].fields[0]: UaType 26: 0 to 25 are known",
+            "dataSetMessages[0].fields[0]: unknown UaType 26: expected 0 to 25",
         ),
         (
             field(json!({ "Value": 1 })).to_string(),
-            "dataSetMessages[0].fields[0]: a Value wants its UaType",
+            "dataSetMessages[0].fields[0]: a Value needs its UaType",
         ),
         (
             field(json!({ "UaType": 6, "Value": 1, "Status": { "Code": 0 } })).to_string(),
-            "dataSetMessages[0].fields[0]: a Variant has neither Status nor timestamps, a DataValue has",
+            "dataSetMessages[0].fields[0]: Status and timestamps belong to a DataValue, not to a Variant",
         ),
         (
             field(json!({ "UaType": 6, "Value": [1, 2, 3], "Dimensions": [2, 2] })).to_string(),
@@ -179,7 +179,7 @@ fn json_that_is_no_datagram_is_refused_with_its_place() {
         ),
         (
             field(json!({ "UaType": 22, "Value": { "UaTypeId": "i=884", "Low": 1 } })).to_string(),
-            "dataSetMessages[0].fields[0].Value: the structure wants a field `High`",
+            "dataSetMessages[0].fields[0].Value: the structure lacks the field `High`",
         ),
         (
             json!({ "publisherId": { "type": "Byte", "value": 256 } }).to_string(),

@@ -253,7 +253,10 @@ impl Inner {
         self.diagnostics.refused += 1;
         let total = self.diagnostics.refused;
         if 10_u64.pow(total.ilog10()) == total {
-            warn!(total, why, "a status of a DiagnosticArray has no condition");
+            warn!(
+                total,
+                why, "cannot show a status of a DiagnosticArray as a condition"
+            );
         }
     }
 }

@@ -125,7 +125,7 @@ impl Watcher {
             let methods = all.len();
             warn!(
                 url = self.url,
-                methods, "no Method of the server can be called: {reason}"
+                methods, "cannot call the Methods of the server: {reason}"
             );
         }
         for (topic, _) in std::mem::take(&mut self.known) {
@@ -137,7 +137,7 @@ impl Watcher {
     async fn miss(&mut self, topic: TopicId, reason: &str) -> Told {
         let before = self.troubles.insert(topic, reason.to_owned());
         if before.is_none_or(|before| before != reason) {
-            warn!(%topic, url = self.url, "its Method cannot be called: {reason}");
+            warn!(%topic, url = self.url, "cannot call the Method: {reason}");
         }
         match self.known.remove(&topic) {
             Some(_) => self.tell.send(News::Lost(topic)).await,

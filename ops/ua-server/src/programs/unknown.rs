@@ -31,7 +31,7 @@ impl UnknownOutcomes {
             Err(error) => {
                 if error.kind() != io::ErrorKind::NotFound {
                     let file = file.display();
-                    warn!(%file, %error, "cannot read the Programs that need a Reset: all are Ready");
+                    warn!(%file, %error, "cannot read the list of Programs that need a Reset: all Programs start as Ready, so check the machine");
                 }
                 BTreeSet::new()
             }
@@ -91,7 +91,7 @@ impl UnknownOutcomes {
         let text: String = goals.iter().map(|goal| format!("{goal}\n")).collect();
         if let Err(error) = replace(&self.file, text.as_bytes()) {
             let file = self.file.display();
-            warn!(%file, %error, "cannot keep the Programs that need a Reset: a restart forgets them");
+            warn!(%file, %error, "cannot store the list of Programs that need a Reset: they will be Ready after a restart");
         }
     }
 }

@@ -37,7 +37,7 @@ pub(super) fn all(mapping: &Mapping, layout: &Layout, address_space: &mut Addres
     if layout.topics.len() > MOST_SHOWN {
         warn!(
             topics = layout.topics.len(),
-            "the PubSub configuration shows the first {MOST_SHOWN} of them"
+            "the PubSub configuration shows only the first {MOST_SHOWN} topics"
         );
     }
     for (at, topic) in layout.topics.iter().take(MOST_SHOWN).enumerate() {

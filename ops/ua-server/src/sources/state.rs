@@ -59,7 +59,7 @@ impl State {
                         server = told.name,
                         url = told.url,
                         secured,
-                        "the server is there"
+                        "connected to the server"
                     );
                 }
                 told.up = true;
@@ -72,7 +72,7 @@ impl State {
                     warn!(
                         server = told.name,
                         url = told.url,
-                        "the server is away, and what comes from it is bad: {reason}"
+                        "disconnected from the server, so its values are bad: {reason}"
                     );
                 }
                 told.up = false;

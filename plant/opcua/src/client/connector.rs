@@ -57,7 +57,7 @@ async fn connect(
         .map_err(|error| failed(format!("{url}: {error}")))?;
     let socket = timeout(within, TcpStream::connect(endpoint.authority()))
         .await
-        .map_err(|_| failed(format!("{url} does not answer")))?
+        .map_err(|_| failed(format!("{url} does not respond")))?
         .map_err(|error| failed(format!("{url}: {error}")))?;
     socket
         .set_nodelay(true)

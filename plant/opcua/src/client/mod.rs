@@ -156,16 +156,16 @@ pub enum Link {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ClientError {
     /// The client is not connected.
-    #[error("there is no connection: {0}")]
+    #[error("not connected: {0}")]
     NotConnected(String),
     /// The server does not answer in time, or the connection is lost before the response.
-    #[error("the server did not answer: {0}")]
+    #[error("the server did not respond: {0}")]
     Lost(String),
     /// The server answers with a Bad status code.
-    #[error("the server answers {0}")]
+    #[error("the server responds with {0}")]
     Status(StatusCode),
     /// The response does not fit the request.
-    #[error("the server answers with {0}")]
+    #[error("the server responds with {0}")]
     Answer(&'static str),
 }
 
@@ -173,7 +173,7 @@ impl From<PartFault> for ClientError {
     fn from(fault: PartFault) -> Self {
         match fault {
             PartFault::Failed(error) => failed(&error),
-            PartFault::Short => Self::Answer("another number of results"),
+            PartFault::Short => Self::Answer("a wrong number of results"),
         }
     }
 }

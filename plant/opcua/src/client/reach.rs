@@ -134,7 +134,7 @@ impl Reach {
                 self.tries.spawn(is_reached(self.url.clone()));
                 Ok(())
             }
-            Step::Lost => Err("the host of the server does not answer".to_owned()),
+            Step::Lost => Err("the host of the server does not respond".to_owned()),
         }
     }
 

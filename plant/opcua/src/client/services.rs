@@ -172,7 +172,7 @@ impl Client {
             let fault = ClientError::from(fault);
             parts.skip(&Err(fault.clone()));
             if matches!(fault, ClientError::Lost(_)) {
-                let unsent = format!("nothing was sent after {fault}");
+                let unsent = format!("not sent after {fault}");
                 parts.skip_all(&Err(ClientError::NotConnected(unsent)));
             }
         }
@@ -323,7 +323,7 @@ impl Client {
             .connection
             .is_some_and(|one| one != session.connects)
         {
-            let other = "there is another connection by now".to_owned();
+            let other = "the connection was replaced".to_owned();
             return Err(ClientError::NotConnected(other));
         }
         let _in_flight = self.shared.calls.start();
@@ -350,7 +350,7 @@ fn as_many<T>(
 ) -> Result<Vec<T>, ClientError> {
     let answer = answer.map_err(|error| failed(&error))?;
     if answer.len() != wanted {
-        return Err(ClientError::Answer("another number of results"));
+        return Err(ClientError::Answer("a wrong number of results"));
     }
     Ok(answer)
 }

@@ -150,7 +150,7 @@ impl Shared {
         let reason = match &*self.link.borrow() {
             Link::Down { reason, .. } => reason.clone(),
             Link::Closed => "the client is closed".to_owned(),
-            Link::Connecting | Link::Up { .. } => format!("{} has not answered yet", self.url),
+            Link::Connecting | Link::Up { .. } => format!("{} has not responded yet", self.url),
         };
         ClientError::NotConnected(reason)
     }
@@ -323,7 +323,7 @@ async fn connect(
     let within = shared.config.timeout;
     let endpoint = timeout(within * 2, endpoint(shared, client))
         .await
-        .map_err(|_| format!("{} does not tell its endpoints", shared.url))??;
+        .map_err(|_| format!("{} does not return its endpoints", shared.url))??;
     let taken = match &shared.servers {
         Some(servers) => servers.take(&endpoint)?,
         None => None,
@@ -378,11 +378,11 @@ async fn connect(
     });
     let opened = opened.await;
     let driving = AbortOnDrop(Some(driving));
-    opened.map_err(|_| format!("{} makes no session", shared.url))??;
+    opened.map_err(|_| format!("{} refuses the session", shared.url))??;
     let limits = OperationLimits::default();
     let (namespaces, started) = timeout(within, what_it_is(&session, &limits))
         .await
-        .map_err(|_| "the server does not tell its namespaces".to_owned())??;
+        .map_err(|_| "the server does not return its namespaces".to_owned())??;
     Ok(Connection {
         connected: Arc::new(Connected {
             session,
@@ -507,17 +507,17 @@ fn no_security(shared: &Shared, offered: &[EndpointDescription]) -> String {
     };
     let config = &shared.config;
     let mut wants = match config.security {
-        SecurityChoice::Best if config.pki.is_some() => "the best that is secured".to_owned(),
+        SecurityChoice::Best if config.pki.is_some() => "the best secured policy".to_owned(),
         SecurityChoice::Best | SecurityChoice::None => "None".to_owned(),
         SecurityChoice::Basic256Sha256 => "Basic256Sha256/SignAndEncrypt".to_owned(),
         SecurityChoice::Aes128Sha256RsaOaep => "Aes128_Sha256_RsaOaep/SignAndEncrypt".to_owned(),
         SecurityChoice::Aes256Sha256RsaPss => "Aes256_Sha256_RsaPss/SignAndEncrypt".to_owned(),
     };
     if config.user.is_some() && config.security == SecurityChoice::Best {
-        wants.push_str(", as a password is not sent without");
+        wants.push_str(", because a password is sent encrypted only");
     }
     format!(
-        "{} offers no security we can have: it offers {offers}, wanted is {wants} (`security`)",
+        "no usable security at {}: it offers {offers}, but {wants} is required (`security` in the mapping)",
         shared.url
     )
 }
@@ -612,7 +612,7 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
                 if !subscribed || is_calling || silence.is_tolerated(now) {
                     published = now;
                 } else if published.elapsed() > LONGEST_SILENCE {
-                    return "the server is silent about its subscriptions".to_owned().into();
+                    return "the server sends no messages for its subscriptions".to_owned().into();
                 }
                 if let Err(reason) = reach.look(is_calling || silence.is_tolerated(now), now) {
                     return reason.into();
@@ -627,7 +627,7 @@ async fn watch_over(shared: &Shared, connection: &mut Connection) -> Why {
             }
         }
         if silence.is_too_long(shared.calls.any(), Instant::now()) {
-            return "the server does not answer".to_owned().into();
+            return "the server does not respond".to_owned().into();
         }
     }
 }

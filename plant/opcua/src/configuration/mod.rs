@@ -248,7 +248,7 @@ impl Configuration {
             .and_then(|der| Certificate::read(der).ok());
         let certificate = read.ok_or(StatusCode::BadCertificateInvalid)?;
         if certificate.application_uri().as_deref() != Some(&self.application_uri) {
-            return Err(self.unfit("the certificate is of another ApplicationUri"));
+            return Err(self.unfit("the certificate has another ApplicationUri"));
         }
         if !certificate.is_valid_at(known::now()) {
             return Err(self.unfit("the certificate is not valid now"));
@@ -283,7 +283,7 @@ impl Configuration {
         if let Some(given) = given {
             return match fits(&given) {
                 true => Ok(Some(given)),
-                false => Err(self.unfit("the private key is not that of the certificate")),
+                false => Err(self.unfit("the private key does not match the certificate")),
             };
         }
         if let Some(next) = next.filter(fits) {
@@ -292,7 +292,7 @@ impl Configuration {
         let own = self.own_key()?;
         match fits(&own) {
             true => Ok(None),
-            false => Err(self.unfit("the certificate is of a key that the server does not have")),
+            false => Err(self.unfit("the certificate does not match a key of the server")),
         }
     }
 
@@ -352,7 +352,7 @@ impl Configuration {
     }
 
     fn unfit(&self, why: &str) -> Refusal {
-        warn!("a new certificate of the server is refused: {why}");
+        warn!("rejected a new certificate of the server: {why}");
         StatusCode::BadInvalidArgument.into()
     }
 }

@@ -102,7 +102,7 @@ impl StoreList {
             // The authority may publish its revocation lists later.
             Ok(()) | Err(Fault::RevocationUnknown | Fault::IssuerRevocationUnknown) => Ok(()),
             Err(fault) => {
-                warn!(%fault, "a new certificate of the server is refused");
+                warn!(%fault, "rejected a new certificate of the server");
                 Err(StatusCode::BadSecurityChecksFailed)
             }
         }
@@ -187,7 +187,7 @@ impl StoreList {
             match known::put_crl(&self.root, one) {
                 Ok(Some(_)) => {}
                 Ok(None) => {
-                    warn!(issuer = ?one.issuer_name(), "a revocation list of an authority that is not known is left out");
+                    warn!(issuer = ?one.issuer_name(), "ignored a revocation list of an unknown authority");
                     return Err(StatusCode::BadCertificateIssuerRevocationUnknown);
                 }
                 Err(error) => {

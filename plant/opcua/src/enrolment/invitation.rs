@@ -18,8 +18,9 @@ use crate::endpoint::EndpointUrl;
 /// The option of every program with an OPC UA certificate.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct GdsArguments {
-    /// The Global Discovery Server of the plant, which issues and renews the certificate and says which certificates are
-    /// trusted: the invitation that `ua-gds invite` prints, its URL alone, or @FILE with either. Needs no other command
+    /// The Global Discovery Server of the plant, which issues and renews the certificate and
+    /// provides the trust list: the invitation that `ua-gds invite` prints, only its URL, or @FILE
+    /// with either
     #[arg(
         long,
         value_name = "INVITATION|URL|@FILE",
@@ -154,7 +155,8 @@ pub enum InvitationFault {
     Part,
     /// The invitation has a token and no fingerprint, so any server could receive the token.
     #[error(
-        "--gds has a token and no sha256=: a token is sent only to a server whose certificate is known"
+        "--gds has a token without sha256=: give the fingerprint of the server too, because the token is \
+         sent only to a server with this certificate"
     )]
     Unpinned,
     /// The file cannot be read.

@@ -223,7 +223,7 @@ impl Enrolment {
         client.close().await;
         visited.unwrap_or_else(|_| {
             Err(format!(
-                "the server has not answered within {LONGEST_VISIT:?}"
+                "the server has not responded within {LONGEST_VISIT:?}"
             ))
         })
     }
@@ -329,8 +329,9 @@ impl Enrolment {
             {
                 warn!(
                     gds = self.gds.url,
-                    "the token of --gds is refused: it has expired, was used, or is for another application; the request waits \
-                     for an administrator, or for another invitation (`ua-gds invite`)"
+                    "the server refused the token of --gds: it has expired, was used, or belongs to another \
+                     application; approve the request (`ua-gds approve`), or use a new invitation (`ua-gds \
+                     invite`)"
                 );
                 self.is_token_refused = true;
                 let request = self.request(old, None).await?;
@@ -358,16 +359,16 @@ impl Enrolment {
             Request::make_with(&key, (&uri, &hosts), (&name, ""), token)
         });
         let signed = signing.await.map_err(|error| error.to_string())?;
-        signed.map_err(|why| format!("no certificate can be requested: {why}"))
+        signed.map_err(|why| format!("cannot request a certificate: {why}"))
     }
 
     /// Trusts the certificates of a trust list, and stores its revocation lists.
     fn trust(&self, lists: &TrustLists) -> Result<(), Why> {
         let store = StoreList::new(&self.root);
-        let failed = |error: std::io::Error| format!("the trust list cannot be kept: {error}");
+        let failed = |error: std::io::Error| format!("cannot store the trust list: {error}");
         store.trust_all(&lists.trusted).map_err(failed)?;
         let kept = store.keep_all(&lists.issuers);
-        kept.map_err(|status| format!("the trust list cannot be kept: {status}"))?;
+        kept.map_err(|status| format!("cannot store the trust list: {status}"))?;
         for list in &lists.revocation_lists {
             match known::put_crl(&self.root, list) {
                 Ok(Some(path)) => debug!(file = %path.display(), "stored a revocation list"),
@@ -389,7 +390,7 @@ impl Enrolment {
         }
         if !certificate.is_valid_at(known::now()) {
             return Err(
-                "the issued certificate is not valid now: one of the clocks is wrong".to_owned(),
+                "the issued certificate is not valid at this time: set the clocks of this host and of the GDS".to_owned(),
             );
         }
         if !matches!(
@@ -397,18 +398,18 @@ impl Enrolment {
             Step::Wait { .. }
         ) {
             // Otherwise the program would restart endlessly.
-            return Err("the issued certificate is to be renewed at once".to_owned());
+            return Err("the issued certificate must be renewed at once".to_owned());
         }
         let key = own_key(&self.root)?;
         if !certificate.is_of_private_key(&key) {
             return Err("the issued certificate is for another key".to_owned());
         }
-        let refused = |status| format!("the issued certificate is refused: {status}");
+        let refused = |status| format!("rejected the issued certificate: {status}");
         let store = StoreList::new(&self.root);
         store.judge_among(certificate, above).map_err(refused)?;
         store.keep_all(above).map_err(refused)?;
         own::replace(&self.root, certificate, &Cause::Enrolment)
-            .map_err(|error| format!("the certificate cannot be written: {error}"))?;
+            .map_err(|error| format!("cannot write the certificate: {error}"))?;
         info!(
             gds = self.gds.url,
             "restarting with the certificate of the plant"
@@ -436,13 +437,13 @@ fn status_of(error: &DirectoryError) -> Option<StatusCode> {
 pub fn own_key(root: &Path) -> Result<Vec<u8>, String> {
     let path = root.join(OWN_KEY);
     let read = std::fs::read(&path).map_err(|error| format!("{}: {error}", path.display()))?;
-    pair::from_pem(&read).ok_or_else(|| format!("{} holds no private key", path.display()))
+    pair::from_pem(&read).ok_or_else(|| format!("{} contains no private key", path.display()))
 }
 
 /// The loopback names, which every certificate may contain.
 const LOOPBACK: [&str; 3] = ["localhost", "127.0.0.1", "::1"];
-const WAITING: &str = "the certificate is requested and waits for an administrator: `ua-gds requests` lists it, `ua-gds \
-    approve NUMBER` has it issued";
+const WAITING: &str = "the certificate request waits for an administrator: list it with `ua-gds requests`, \
+                       approve it with `ua-gds approve NUMBER`";
 /// Interval of reading the store: an administrator may have replaced the certificate, or the clock
 /// may have been set.
 const LOOK: Duration = Duration::from_secs(2);

@@ -85,7 +85,7 @@ fn bytes(path: &Path, file: &str) -> Result<Vec<u8>, NodeSetError> {
     if u64::try_from(bytes.len()).is_ok_and(|length| length <= LARGEST_NODESET) {
         return Ok(bytes);
     }
-    let reason = format!("it has more than {} MiB", LARGEST_NODESET >> 20);
+    let reason = format!("it is larger than {} MiB", LARGEST_NODESET >> 20);
     Err(not_a_document(file, reason))
 }
 

@@ -64,21 +64,21 @@ impl NodeSetError {
     #[must_use]
     pub const fn help(&self) -> &'static str {
         match self {
-            Self::Read { .. } => "the path is taken from the folder of the file it stands in",
+            Self::Read { .. } => "the path is relative to the folder of the file that contains it",
             Self::Xml { .. } => {
                 "a NodeSet2 file is an XML document <UANodeSet xmlns=\"http://opcfoundation.org/UA/2011/03/UANodeSet.xsd\">"
             }
-            Self::Node { .. } => "mend the file, or have whoever made it export it anew",
+            Self::Node { .. } => "correct the file, or export it again",
             Self::Values { .. } | Self::Unread { .. } | Self::MoreUnread { .. } => {
-                "a structure is read by the definition that its DataType has in one of the files; its nodes are there, without the values"
+                "a structure needs the definition of its DataType in one of the files; the nodes exist without values"
             }
             Self::Missing { .. } => {
-                "name the NodeSet2 file of that namespace too; the order of the files does not matter"
+                "add the NodeSet2 file of this namespace; the order of the files does not matter"
             }
-            Self::Circle(_) => "one of them has to do without the others",
-            Self::Twice { .. } => "leave one of the two out",
-            Self::Core { .. } => "the server has that namespace already: leave the file out",
-            Self::Many => "leave out what the cell does not need",
+            Self::Circle(_) => "remove the dependency from one of them",
+            Self::Twice { .. } => "remove one of the two",
+            Self::Core { .. } => "the server already has this namespace: remove the file",
+            Self::Many => "remove the files that the cell does not need",
         }
     }
 }
@@ -450,7 +450,7 @@ fn length(path: &Path) -> Result<u64, NodeSetError> {
     };
     let found = std::fs::metadata(path).map_err(fault)?;
     if !found.is_file() {
-        return Err(fault(io::Error::other("it is no file")));
+        return Err(fault(io::Error::other("it is not a file")));
     }
     Ok(found.len())
 }

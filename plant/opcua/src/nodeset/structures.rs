@@ -50,7 +50,7 @@ impl TypeLoader for Structures {
         let read = loader.as_ref()?.load_from_xml(node_id, stream, ctx, name)?;
         Some(read.and_then(|read| {
             let structure = read.as_dyn_any().downcast::<DynamicStructure>();
-            let structure = structure.map_err(|_| Error::decoding("it is no structure"))?;
+            let structure = structure.map_err(|_| Error::decoding("it is not a structure"))?;
             Ok(Box::new(Exact(*structure)) as Box<dyn DynEncodable>)
         }))
     }
@@ -137,7 +137,7 @@ impl ExpandedMessageInfo for Exact {
 /// Returns the reason.
 pub(super) fn check_sent(value: &Variant, context: &Context<'_>) -> Result<(), String> {
     if !is_known(value) {
-        return Err("the type of its structure is not known".to_owned());
+        return Err("the type of its structure is unknown".to_owned());
     }
     let encoded = BinaryEncodable::encode(value, &mut std::io::sink(), context);
     encoded.map_err(|error| error.to_string())

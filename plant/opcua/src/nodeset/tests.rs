@@ -134,7 +134,7 @@ fn values_that_cannot_be_sent_are_left_out_with_their_line_node_and_reason() {
     );
     assert!(told[1].starts_with("a.xml:6: node ns=1;i=3: "), "{told:?}");
     assert_eq!(told.len(), 11);
-    assert_eq!(told[10], "a.xml: the values of 5 more nodes cannot be read");
+    assert_eq!(told[10], "a.xml: cannot read the values of 5 more nodes");
     assert!(faults.iter().all(|fault| !fault.is_fatal()));
     assert_eq!((there.nodes.len(), there.unread.len()), (15, 15));
     assert_eq!(value_of(&space, 2), None);

@@ -146,16 +146,18 @@ pub enum ServerError {
     #[error(transparent)]
     NodeSet(#[from] NodeSetError),
     /// The security policies require certificates, but no directory is configured.
-    #[error("security other than None needs a directory for certificates, and none is given")]
+    #[error(
+        "security policies other than None need a directory for certificates: give one (--pki)"
+    )]
     NoPki,
     /// The server has no security policy.
     #[error("the endpoint has no security policy, not even None")]
     NoSecurity,
     /// An error of the operating system.
-    #[error("the listening socket cannot be used: {0}")]
+    #[error("cannot use the listening socket: {0}")]
     Io(#[from] io::Error),
     /// The library refused the configuration.
-    #[error("the OPC UA server cannot be configured: {0}")]
+    #[error("cannot configure the OPC UA server: {0}")]
     Configuration(String),
 }
 

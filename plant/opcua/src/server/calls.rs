@@ -184,7 +184,7 @@ impl Calls {
     /// Returns the handler of a call; `None` for objects of other node managers.
     #[expect(
         clippy::type_complexity,
-        reason = "said in one place, taken apart in one place"
+        reason = "set in one place and read in one place"
     )]
     fn route(
         &self,

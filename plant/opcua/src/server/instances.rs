@@ -158,25 +158,25 @@ pub struct VariableSpec {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InstanceError {
     /// The type does not exist.
-    #[error("there is no ObjectType {0}")]
+    #[error("unknown ObjectType {0}")]
     NoType(NodeId),
     /// The type is abstract and cannot have instances.
     #[error("{0} is abstract: only its subtypes have instances")]
     Abstract(NodeId),
     /// The interface does not exist.
-    #[error("there is no interface {0}")]
+    #[error("unknown interface {0}")]
     NoInterface(NodeId),
     /// The parent does not exist.
-    #[error("the parent {0} is not there")]
+    #[error("the parent {0} does not exist")]
     NoParent(NodeId),
     /// The NodeId is not in a namespace for instances.
-    #[error("{0} is not of a namespace for instances")]
+    #[error("{0} is not in a namespace for instances")]
     Foreign(NodeId),
     /// A node with this NodeId exists already.
-    #[error("there is a node {0} already")]
+    #[error("a node {0} already exists")]
     Taken(NodeId),
     /// The type is too deep or too large, or contains itself.
-    #[error("{0} has more children than a server can have, or is made of itself")]
+    #[error("{0} has more children than a server can have, or contains itself")]
     TooLarge(NodeId),
     /// No type declares a requested optional child.
     #[error("the type has no optional child {0}")]

@@ -121,7 +121,7 @@ impl Server {
         } = waiting;
         let serving = tokio::spawn(async move {
             if let Err(error) = server.run_with(listener).await {
-                error!(error, "the OPC UA server has ended");
+                error!(error, "the OPC UA server has stopped");
             }
         });
         let sessions = Arc::clone(&self.inner.calls.sessions);

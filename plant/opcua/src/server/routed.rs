@@ -45,7 +45,7 @@ type Done = Result<(), StatusCode>;
 
 #[expect(
     elided_lifetimes_in_paths,
-    reason = "the trait leaves them out, and has to be met exactly"
+    reason = "the trait omits them and must be matched exactly"
 )]
 #[async_trait]
 impl NodeManager for Routed {

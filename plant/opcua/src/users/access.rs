@@ -108,16 +108,16 @@ pub struct Login {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum LoginFault {
     /// Anonymous users are refused.
-    #[error("anonymous users are not let in")]
+    #[error("anonymous users are not allowed")]
     Anonymous,
     /// The user does not exist, or the password is wrong.
-    #[error("no such user, or another password")]
+    #[error("unknown user or wrong password")]
     Password,
     /// No user has the certificate.
     #[error("no user has that certificate (`ua-server user add NAME --certificate FILE`)")]
     Certificate,
     /// The certificate is not valid at the moment.
-    #[error("the user's certificate is not valid now")]
+    #[error("the certificate of the user is not valid at this time")]
     Expired,
 }
 

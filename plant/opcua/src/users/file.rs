@@ -62,7 +62,7 @@ impl std::fmt::Debug for User {
 #[derive(Debug, thiserror::Error)]
 pub enum UserFault {
     /// The folder or a file in it cannot be used.
-    #[error("the users in {path} cannot be used: {source}")]
+    #[error("cannot use the users in {path}: {source}")]
     Io {
         /// The file.
         path: PathBuf,
@@ -71,7 +71,7 @@ pub enum UserFault {
         source: io::Error,
     },
     /// Other users can read the hashes.
-    #[error("{0} can be read by others than its owner: chmod 600 {0}")]
+    #[error("other users can read {0}: chmod 600 {0}")]
     Open(PathBuf),
     /// The file is too large or contains too many users.
     #[error("{0} is larger than {LARGEST_FILE} bytes, or has more than {MOST_USERS} users")]
@@ -92,7 +92,7 @@ pub enum UserFault {
     )]
     Name,
     /// The user does not exist.
-    #[error("there is no user {0}")]
+    #[error("unknown user {0}: `ua-server user list` shows the users")]
     Unknown(String),
     /// A user without a role would have no rights.
     #[error(
@@ -106,7 +106,7 @@ pub enum UserFault {
     #[error("a password has 8 to {LARGEST_PASSWORD} bytes")]
     Password,
     /// The certificate cannot be read.
-    #[error("{path} is no certificate: {why}")]
+    #[error("{path} is not a certificate: {why}")]
     Certificate {
         /// The file.
         path: PathBuf,
@@ -168,7 +168,7 @@ impl Users {
             }
             let (name, user) = user(line).map_err(|why| (number, why))?;
             if by_name.insert(name.to_owned(), user).is_some() {
-                return Err((number, "the name is there twice".to_owned()));
+                return Err((number, "the name occurs twice".to_owned()));
             }
         }
         Ok(Self { by_name })
@@ -309,7 +309,7 @@ fn user(line: &str) -> Result<(&str, User), String> {
         Some(thumbprint) => {
             let thumbprint = thumbprint.to_lowercase();
             if thumbprint.len() != 40 || !thumbprint.bytes().all(|b| b.is_ascii_hexdigit()) {
-                return Err("behind x509: stand the 40 digits of a SHA-1 thumbprint".to_owned());
+                return Err("expected the 40 digits of a SHA-1 thumbprint after x509:".to_owned());
             }
             Credential::Certificate(thumbprint)
         }
@@ -323,13 +323,14 @@ fn sound_hash(text: &str) -> Result<String, String> {
     let hash = PasswordHash::new(text)
         .map_err(|_| "expected an argon2 hash in the PHC format, as $argon2id$..".to_owned())?;
     let parameters = argon2::Params::try_from(&hash)
-        .map_err(|_| "the parameters of the hash cannot be".to_owned())?;
+        .map_err(|_| "the parameters of the hash are not valid".to_owned())?;
     if !hash.algorithm.as_str().starts_with("argon2") || hash.hash.is_none() {
         return Err("expected an argon2 hash in the PHC format, as $argon2id$..".to_owned());
     }
     if parameters.m_cost() > MOST_MEMORY || parameters.t_cost() > MOST_PASSES {
         return Err(format!(
-            "a hash may take up {MOST_MEMORY} KiB and {MOST_PASSES} passes at most: everybody who tries a password has it made"
+            "a hash may need at most {MOST_MEMORY} KiB and {MOST_PASSES} passes, because the server \
+             computes it for each attempt"
         ));
     }
     Ok(text.to_owned())
@@ -451,7 +452,7 @@ mod tests {
     fn a_line_that_is_none_of_a_user_is_told_by_its_number_and_not_by_what_stands_in_it() {
         for (text, why) in [
             ("anna operator hunter2hunter2", "argon2"),
-            ("anna boss $argon2id$x", "no role"),
+            ("anna boss $argon2id$x", "not a role"),
             ("anna operator", "expected a name"),
             ("ann/a operator x509:00", "name"),
             ("anonymous operator x509:00", "anonymous"),

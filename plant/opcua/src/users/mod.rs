@@ -75,7 +75,9 @@ impl std::str::FromStr for Role {
 
 /// An unknown role name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is no role: observer, operator, engineer, security_admin, configure_admin")]
+#[error(
+    "`{0}` is not a role: expected observer, operator, engineer, security_admin or configure_admin"
+)]
 pub struct UnknownRole(String);
 
 /// A set of roles.

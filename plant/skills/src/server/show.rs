@@ -240,7 +240,10 @@ impl Nodes {
         if let Some(node) = self.method(method)
             && let Err(status) = server.set_executable(node, executable)
         {
-            tracing::warn!(skill = self.name, "{method} cannot be shown: {status}");
+            tracing::warn!(
+                skill = self.name,
+                "cannot show whether {method} is executable: {status}"
+            );
         }
     }
 }
@@ -321,7 +324,7 @@ fn named(nodes: &BTreeMap<String, NodeId>, values: &[(String, Value)]) -> Vec<(N
 
 fn show(server: &Server, skill: &str, values: Vec<(NodeId, DataValue)>) {
     if let Err(status) = server.show_all(values) {
-        tracing::warn!(skill, "its values cannot be shown: {status}");
+        tracing::warn!(skill, "cannot show the values of the skill: {status}");
     }
 }
 

@@ -63,7 +63,7 @@ pub(super) fn parameters(
         }
         let Some(builtin) = builtin_of(&facts.data_type) else {
             tracing::warn!(
-                "{path}: its data type {} is not one that a skill can be told in",
+                "{path}: skills do not support the data type {}",
                 facts.data_type
             );
             continue;

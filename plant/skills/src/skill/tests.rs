@@ -549,7 +549,7 @@ async fn stopped_work_without_a_known_end_needs_a_reset() {
         (
             How::Deaf,
             None,
-            "halted by session 1; the outcome is unknown: its work had not come to a stand after 1s and was broken off",
+            "halted by session 1; the outcome is unknown: its work did not stop within 1s and was broken off",
         ),
         (
             How::Lost,
@@ -559,7 +559,7 @@ async fn stopped_work_without_a_known_end_needs_a_reset() {
         (
             How::Deaf,
             limit,
-            "the work was not done within 20ms; the outcome is unknown: its work had not come to a stand after 1s and was broken off",
+            "the work was not done within 20ms; the outcome is unknown: its work did not stop within 1s and was broken off",
         ),
     ] {
         let bench = bench_of(how, "GraspSkillType", limit);
