@@ -46,7 +46,7 @@ calls:
     let line = bridge.wait_for_line("waiting for: ", SOON);
     for expected in [
         "topic /start_buton (no publisher; did you mean /start_button?)",
-        "subscriber of /start_button (no node reads it, and /robot publishes it too",
+        "subscriber of /start_button (no node subscribes to it, and /robot publishes it too",
         "service /no_such (no server)",
         "space 2 (nothing received on lo",
     ] {
@@ -84,7 +84,7 @@ variables:
     for expected in [
         "it cannot reach http://10.77.0.1:",
         "set ROS_IP",
-        "10.77.0.1, which is no address of this host",
+        "10.77.0.1, which is not an address of this host",
         "space 0 (nothing received on lo",
     ] {
         assert!(line.contains(expected), "{expected}: {line}");
@@ -122,6 +122,6 @@ variables:
     let other = cell.bridge_ros2_alone(&[&file]);
     let mut other = other.args(["--domain", "3"]).start();
     let line = other.wait_for_line("waiting for: ", SOON);
-    assert!(line.contains("the mapping declares 1, 2 only"), "{line}");
+    assert!(line.contains("the mapping declares only 1, 2"), "{line}");
     assert!(metrics(METRICS_ROS2).is_some());
 }

@@ -671,7 +671,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     });
     assert_eq!(lost["end"], "ABORTED");
     let why = lost["text"].as_str().unwrap();
-    assert!(why.contains("who executes the action is gone"), "{why}");
+    assert!(why.contains("the executor of the action is lost"), "{why}");
 }
 
 /// A component with skills executed by a base of ROS 2 and a belt of ROS 1.

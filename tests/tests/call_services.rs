@@ -73,7 +73,7 @@ fn rclpy_asks_for_a_service_of_rospy_and_is_told_that_it_fails() {
     let refused = set_bool(&mut judge, OF_ROS1, false);
     assert_eq!(refused["success"], false, "{refused}");
     let why = refused["message"].as_str().unwrap();
-    assert!(why.contains("went wrong"), "{why}");
+    assert!(why.contains("and failed"), "{why}");
     for value in [true, false] {
         let asked = |line: &Value| (line.get("value")? == value).then_some(());
         server.wait_for_json("the server is asked", SOON, asked);

@@ -251,7 +251,7 @@ fn a_secured_channel_is_for_whom_it_trusts_who_registers_only_itself() {
     let itself = "urn:ua-bridge:system-tests:client";
     let mut strict = lds(&["--pki", ours]);
     assert_ne!(register(itself), "Good");
-    let refused = strict.wait_for_line("a client is not talked to", SOON);
+    let refused = strict.wait_for_line("rejected a client", SOON);
     let told = ["BadCertificateUntrusted", "`ua-server trust", "lds-pki"];
     assert!(told.iter().all(|one| refused.contains(one)), "{refused}");
     let counters = metrics(STATUS).unwrap()["counters"].clone();
@@ -369,9 +369,9 @@ fn a_discovery_server_that_starts_last_or_anew_learns_of_everybody() {
         return;
     };
     let mut gripper = announced("gripper", &[]);
-    gripper.wait_for_line("not registered yet", SOON);
+    gripper.wait_for_line("not registered at the discovery server yet", SOON);
     let mut quiet = announced("quiet", &["--no-mdns"]);
-    quiet.wait_for_line("not registered yet", SOON);
+    quiet.wait_for_line("not registered at the discovery server yet", SOON);
     let all = || {
         registered("urn:who:gripper")
             .and_then(|_| registered("urn:who:quiet"))

@@ -235,7 +235,7 @@ fn a_server_that_announces_itself_to_nobody_is_found_where_somebody_asks_for_tha
     let ended = ua_space(&["discover", "--scan", "127.0.0.0/8"]);
     assert_eq!(ended.code, 64, "{}", ended.text());
     assert!(
-        ended.text().contains("/16 is the widest"),
+        ended.text().contains("use /16 or a smaller range"),
         "{}",
         ended.text()
     );
@@ -390,14 +390,14 @@ fn what_is_named_otherwise_than_it_is_there_is_found() {
         })
         .collect();
     let expected = [
-        ("M123", 4, "the URI has index 3"),
+        ("M123", 4, "the server has this URI at index 3"),
         ("M121", 6, "did you mean `/conveyor/running`?"),
         ("M122", 7, "type: std_msgs/UInt32"),
         ("M122", 8, "type: std_msgs/Bool"),
         ("M124", 9, "did you mean `/conveyor/start`?"),
         ("M124", 11, "did you mean `/arm/grip`?"),
         ("M122", 12, "type: std_srvs/SetBool"),
-        ("M120", 14, "is a robot with such topics running?"),
+        ("M120", 14, "check that a robot with such topics runs"),
     ];
     assert_eq!(found.len(), expected.len(), "{found:?}");
     for (found, expected) in found.iter().zip(expected) {

@@ -170,7 +170,7 @@ fn a_bridge_whose_dds_is_bound_to_an_address_that_is_another_ends_to_be_started_
     cable.lay(ELSEWHERE);
     let ended = bridge.wait_for_end(SOON);
     assert_eq!(ended.code(), Some(69));
-    bridge.wait_for_line("to be started again", SOON);
+    bridge.wait_for_line("should restart this program", SOON);
     let _again = start();
 }
 
@@ -188,5 +188,5 @@ fn a_bridge_whose_ros_1_address_is_another_ends_to_be_started_again() {
     assert!(why.contains(&format!("{WIRE} ({HERE})")), "{why}");
     cable.lay(ELSEWHERE);
     assert_eq!(bridge.wait_for_end(SOON).code(), Some(69));
-    bridge.wait_for_line("to be started again", SOON);
+    bridge.wait_for_line("should restart this program", SOON);
 }

@@ -202,7 +202,7 @@ fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
     let first = about("hash");
 
     save(&file, &mapping(2, "/r1").replace("origin: 1", "origin: 7"));
-    bridge.wait_for_line("nothing is changed", SOON);
+    bridge.wait_for_line("the running mapping stays in use", SOON);
     let told = bridge.lines().join("\n");
     assert_eq!(
         told.matches("error[M014]").count(),
@@ -231,7 +231,7 @@ fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
         (Value::Null, 1.into())
     );
     assert_ne!(about("hash"), first);
-    bridge.wait_for_line("unbound", SOON);
+    bridge.wait_for_line("stopped bridging", SOON);
 
     // Changed as a Kubernetes ConfigMap is: the file stays a link, and its target is replaced.
     let (folder, link) = (cell.folder(), file.with_extension("link"));
@@ -242,7 +242,7 @@ fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
     .unwrap();
     std::os::unix::fs::symlink("other.yaml", &link).unwrap();
     fs::rename(&link, &file).unwrap();
-    bridge.wait_for_line("restart needed: pubsub.ttl", SOON);
+    bridge.wait_for_line("restart needed for changes of: pubsub.ttl", SOON);
     assert_eq!(about("variables"), 3);
     assert_eq!(about("restart_needed"), serde_json::json!(["pubsub.ttl"]));
     let _third = node.publish(&["/r3".to_owned()]);
@@ -288,7 +288,7 @@ fn a_definition_file_that_is_saved_counts_and_a_faulty_one_changes_nothing_and_s
     let first = about("hash");
 
     save(&folder.join("Point.msg"), "float64 x\nfloat64 9y\n");
-    bridge.wait_for_line("nothing is changed", SOON);
+    bridge.wait_for_line("the running mapping stays in use", SOON);
     let why = about("stale");
     let why = why.as_str().unwrap();
     assert!(why.contains("geometry_msgs/msg/Point.msg:2: "), "{why}");
@@ -310,13 +310,13 @@ fn a_definition_file_that_is_saved_counts_and_a_faulty_one_changes_nothing_and_s
     assert!(
         why.as_str()
             .unwrap()
-            .contains("`geometry_msgs/Point` needs"),
+            .contains("a type that `geometry_msgs/Point` uses"),
         "{why}"
     );
     assert_eq!(about("reloads"), 0);
 
     save(&folder.join("Point.msg"), POINT);
-    bridge.wait_for_line("was read again", SOON);
+    bridge.wait_for_line("reloaded ", SOON);
     assert_eq!((about("stale"), about("reloads")), (Value::Null, 1.into()));
     assert_eq!(
         about("hash"),
@@ -417,8 +417,8 @@ fn bridge_ros2_leaves_the_routes_alone_that_an_edit_does_not_name() {
         (heard_of(1) > 10 && heard_of(2) > 10).then_some(())
     });
     save(&file, &mapping("/moved"));
-    bridge.wait_for_line("was read again", SOON);
-    bridge.wait_for_line("unbound topic=ua_2_2_1", SOON);
+    bridge.wait_for_line("reloaded ", SOON);
+    bridge.wait_for_line("stopped bridging topic=ua_2_2_1", SOON);
     let (one, two) = (heard_of(1), heard_of(2));
     eventually("both are heard again", SOON, || {
         (heard_of(1) > one + 10 && heard_of(2) > two + 10).then_some(())
@@ -429,7 +429,7 @@ fn bridge_ros2_leaves_the_routes_alone_that_an_edit_does_not_name() {
     assert!(
         !lines
             .iter()
-            .any(|line| line.contains("unbound topic=ua_2_2_2"))
+            .any(|line| line.contains("stopped bridging topic=ua_2_2_2"))
     );
     let heard = heard.lock().unwrap();
     let (first, number) = heard[&2][0];
@@ -498,7 +498,7 @@ fn of_500_routes_from_dds_at_50_hz_only_the_edited_one_notices_the_edit() {
         (1..=ROUTES).all(|route| heard_of(route) > 25).then_some(())
     });
     save(&file, &mapping("/moved", ""));
-    bridge.wait_for_line("was read again", SOON);
+    bridge.wait_for_line("reloaded ", SOON);
     writers(0);
     eventually("the other topic has a reader", SOON, || {
         (paced(&mut moved, 1).1 == 1).then_some(())
@@ -523,7 +523,7 @@ fn of_500_routes_from_dds_at_50_hz_only_the_edited_one_notices_the_edit() {
     let lines = bridge.lines();
     let unbound: Vec<&String> = lines
         .iter()
-        .filter(|line| line.contains("unbound"))
+        .filter(|line| line.contains("stopped bridging"))
         .collect();
     assert_eq!(unbound.len(), 2, "{unbound:?}");
     let heard = heard.lock().unwrap();
@@ -582,7 +582,7 @@ fn the_server_has_the_nodes_of_the_saved_mapping_and_its_clients_stay() {
         &part,
         "variables:\n  - {node: ns=2;i=3, name: New, type: Double, origin: 0}\n",
     );
-    server.wait_for_line("was read again", SOON);
+    server.wait_for_line("reloaded ", SOON);
     assert_eq!(read(&nodes), Some(vec![waiting.to_owned(); 3]));
     told(json!([["ns=2;i=3", added]]));
     save(
@@ -591,7 +591,7 @@ fn the_server_has_the_nodes_of_the_saved_mapping_and_its_clients_stay() {
     );
     told(json!([["ns=2;i=3", other_type]]));
     save(&file, &whole.replace("node: ns=2;i=2,", "node: ns=2;i=7,"));
-    server.wait_for_line("unbound topic=ua_1_2_2", SOON);
+    server.wait_for_line("stopped bridging topic=ua_1_2_2", SOON);
     let after = read(&nodes).unwrap();
     assert_eq!(after, [waiting, unknown, waiting]);
     told(json!([["ns=2;i=2", deleted], ["ns=2;i=7", added]]));

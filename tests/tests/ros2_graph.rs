@@ -400,9 +400,11 @@ fn a_subscriber_that_asks_for_more_than_is_offered_is_named_and_counted() {
             "transient_local",
         ],
     );
-    let told = bridge.wait_for_line("is not matched", SOON);
+    let told = bridge.wait_for_line("is not connected: for the QoS", SOON);
     assert!(
-        told.contains("in durability volatile is offered and transient local requested"),
+        told.contains(
+            "for the QoS policy durability, volatile is offered and transient local requested"
+        ),
         "{told}"
     );
     eventually("it is counted", SOON, || {

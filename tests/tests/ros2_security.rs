@@ -166,7 +166,7 @@ fn who_is_not_of_the_enclave_gets_and_gives_nothing_and_is_told_of() {
     let open = cell.cyclone_c(&["sub", THERE.1, STRING]);
     let _open_writer = cell.cyclone_c(&sends(BACK.1, "in the open"));
     let _open_reader = cell.cyclone_c(&["sub", BACK.1, STRING]);
-    bridge.wait_for_line("is kept out: it is not secured", SOON);
+    bridge.wait_for_line("is rejected: it has no DDS Security", SOON);
     let stranger = cell
         .secured_cyclone(&others, &["sub", THERE.1, STRING])
         .start()
@@ -174,7 +174,7 @@ fn who_is_not_of_the_enclave_gets_and_gives_nothing_and_is_told_of() {
     let _strange_writer = cell
         .secured_cyclone(&others, &sends(BACK.1, "of a stranger"))
         .start();
-    bridge.wait_for_line("does not prove who it is", SOON);
+    bridge.wait_for_line("it did not authenticate", SOON);
 
     // Values of the peers in the enclave cross throughout.
     let reader = cell
@@ -243,7 +243,7 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
     with(
         "governance.p7s",
         &theirs.join("governance.p7s"),
-        &["governance.p7s", "signature", "sign it anew"],
+        &["governance.p7s", "signature", "sign it again"],
     );
     with(
         "permissions.p7s",
@@ -254,7 +254,7 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
     with(
         "permissions.p7s",
         &own.join("permissions.p7s"),
-        &["does not let the bridge into domain 2"],
+        &["cannot join domain 2 with the enclave"],
     );
     with(
         "identity_ca.cert.pem",
@@ -264,7 +264,7 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
     with(
         "key.pem",
         &theirs.join("key.pem"),
-        &["key.pem", "not that of cert.pem"],
+        &["key.pem", "does not match cert.pem"],
     );
     with("key.pem", &own.join("cert.pem"), &["key.pem", "PKCS#8"]);
     with(
@@ -276,14 +276,14 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
     // Also where the bridge may run unsecured: invalid files show the intent to be secured.
     let revoked = enclave.join("crl.pem");
     fs::write(&revoked, "").unwrap();
-    refused(&["crl.pem", "make a new keystore"]);
+    refused(&["crl.pem", "create a new keystore"]);
     let permissive = cell.secured_bridge(&keystore, &[]);
     let (code, lines) = refusal(permissive.env("ROS_SECURITY_STRATEGY", "Permissive"));
     assert!(code == Some(78) && lines.contains("crl.pem"), "{lines}");
     fs::remove_file(revoked).unwrap();
 
     keystore.govern(&Governance::all("SIGNED"));
-    refused(&["does not let the bridge into domain 2", "SIGNED"]);
+    refused(&["cannot join domain 2 with the enclave", "SIGNED"]);
     keystore.govern(&Governance::SROS2);
     keystore.certify("bridge", -1);
     refused(&["cert.pem", "expired on"]);
@@ -301,7 +301,10 @@ fn a_key_others_can_read_is_told_of() {
     let key = keystore.enclave("bridge").join("key.pem");
     fs::set_permissions(key, fs::Permissions::from_mode(0o644)).unwrap();
     let mut bridge = answering(cell.secured_bridge(&keystore, &[]));
-    bridge.wait_for_line("others on this machine can read this key (mode 644)", SOON);
+    bridge.wait_for_line(
+        "other users of this host can read this key (mode 644)",
+        SOON,
+    );
 }
 
 /// With either build: without DDS Security, only this behaviour can be tested.
@@ -317,14 +320,14 @@ fn a_bridge_that_cannot_be_secured_does_not_run_in_the_clear_unless_it_may() {
             .env("ROS_SECURITY_KEYSTORE", cell.folder().join("nowhere"))
     };
     let why = if has_security() {
-        "there is no folder"
+        "does not exist: create it with `ros2 security"
     } else {
         "built without DDS Security"
     };
     let (code, lines) = refusal(bridge("Enforce"));
     assert_eq!(code, Some(78), "{lines}");
     assert!(
-        lines.contains("the bridge cannot be secured") && lines.contains(why),
+        lines.contains("DDS Security cannot be set up") && lines.contains(why),
         "{lines}"
     );
 
@@ -333,7 +336,7 @@ fn a_bridge_that_cannot_be_secured_does_not_run_in_the_clear_unless_it_may() {
     assert!(lines.contains("Enforce or Permissive"), "{lines}");
 
     let mut open = answering(bridge("Permissive"));
-    let warned = open.wait_for_line("NOT secured", SOON);
+    let warned = open.wait_for_line("WITHOUT security", SOON);
     assert!(warned.contains(why), "{warned}");
     open.wait_for_line("DDS Security is off", SOON);
 }

@@ -12,7 +12,7 @@ use super::{Greeter, LDS, SOON, lds, list, told, who};
 const GRIPPER: &str = "urn:example:gripper";
 const ROBOT: &str = "urn:example:robot";
 const QUIET: &str = "urn:who:quiet";
-const TAKES_OVER: &str = "no discovery server is there: it is in this program from now on";
+const TAKES_OVER: &str = "no discovery server runs: this program is the discovery server now";
 
 fn component(yaml: &str) -> Child {
     let example = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../examples/plant");
@@ -182,7 +182,7 @@ fn an_embedded_discovery_server_takes_registrations_over_secured_channels_of_who
         cell.asyncua_once("opcua_discovery.py", &all).remove(0)["status"].clone()
     };
     assert_ne!(register(), "Good");
-    let refused = server.wait_for_line("its certificate is not trusted", SOON);
+    let refused = server.wait_for_line("whose certificate is not trusted", SOON);
     let trusted = cell.folder().join("pki/trusted");
     assert!(refused.contains(trusted.to_str().unwrap()), "{refused}");
     std::fs::copy(
@@ -195,5 +195,5 @@ fn an_embedded_discovery_server_takes_registrations_over_secured_channels_of_who
     assert!(uris(&lines).iter().any(|uri| uri == itself), "{lines:?}");
     server.end();
     let mut server = cell.ua_server(&["--endpoint", LDS, "--lds", "embed"]);
-    server.wait_for_line("the server itself is at", SOON);
+    server.wait_for_line("the server itself listens at", SOON);
 }

@@ -254,7 +254,7 @@ fn people_issue_certificates_for_requests_and_with_keys() {
         &["ca", "issue", path(&out), "--out", path(&out)],
     );
     assert!(
-        text(&wrong.stderr).contains("is no signing request"),
+        text(&wrong.stderr).contains("is not a signing request"),
         "{wrong:?}"
     );
 }

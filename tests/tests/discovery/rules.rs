@@ -227,7 +227,7 @@ fn ours_registers_with_node_opcua_over_a_secured_channel_once_that_is_trusted() 
         "--pki",
         pki.to_str().unwrap(),
     ]);
-    gripper.wait_for_line("not registered: refused", SOON);
+    gripper.wait_for_line("cannot register at the discovery server: refused", SOON);
     let rejected = std::fs::read_dir(pki.join("rejected")).unwrap();
     let rejected = rejected
         .map(|file| file.unwrap().path())

@@ -342,7 +342,7 @@ fn a_publisher_is_found_again_after_every_kind_of_end() {
 
     first.signal(Signal::SIGKILL);
     first.wait_for_end(SOON);
-    let complaint = bridge.wait_for_line("no connection to a registered publisher", SOON);
+    let complaint = bridge.wait_for_line("cannot connect to a registered publisher", SOON);
     assert!(
         complaint.contains("rosnode cleanup") && complaint.contains("/rospy_pub"),
         "{complaint}"
@@ -574,7 +574,7 @@ fn a_bridge_whose_name_is_taken_ends_and_says_so() {
     let _out = thief.advertise("/anything", string_type(), false);
     let status = bridge.wait_for_end(SOON);
     assert!(!status.success());
-    bridge.wait_for_line("/line/cell was told to shut down", SOON);
+    bridge.wait_for_line("shut down the ROS 1 node /line/cell", SOON);
     eventually("the other has the name", SOON, || {
         thief.is_registered().then_some(())
     });

@@ -321,7 +321,7 @@ async fn a_value_that_waits_for_room_when_its_topic_is_given_up_is_counted() {
         _ => None,
     })
     .await;
-    assert_eq!(lost, (Some(of), "its writer was given up", 1));
+    assert_eq!(lost, (Some(of), "the writer of the topic was replaced", 1));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]

@@ -108,7 +108,7 @@ fn open_discovery_in_protected_datagrams_is_warned_of_and_works_with_who_protect
     });
     let mut ua = UaSide::join();
     let mut bridge = answering(cell.secured_bridge(&keystore, &[]));
-    bridge.wait_for_line("nodes of Cyclone DDS are not found", SOON);
+    bridge.wait_for_line("nodes of Cyclone DDS are not discovered", SOON);
     let reader = cell.secured_fastdds(&keystore, &["sub", THERE.1, STRING]);
     reaches(&mut ua, "there", &reader.start());
     let _writer = cell

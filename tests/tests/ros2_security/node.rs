@@ -59,7 +59,7 @@ fn a_node_of_ros_2_without_an_enclave_gets_and_gives_nothing_and_is_told_of() {
         judge.ask(json!({"subscribe": THERE.1, "type": string}));
         let publish = json!({"publish": BACK.1, "type": string, "value": {"data": "in the open"}});
         judge.ask(publish.clone());
-        bridge.wait_for_line("is kept out: it is not secured", SOON);
+        bridge.wait_for_line("is rejected: it has no DDS Security", SOON);
         // Peers in the enclave are served throughout.
         let reader = cell
             .secured_cyclone(&keystore, &["sub", THERE.1, STRING])

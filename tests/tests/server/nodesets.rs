@@ -235,7 +235,7 @@ fn a_node_that_the_mapping_leaves_is_that_of_its_file_again_and_other_files_need
     assert!(range.contains("10"), "the file's range: {range}");
 
     drop(cell.file("line.xml", &LINE.replace(">0.5<", ">0.75<")));
-    let told = server.wait_for_line("restart needed: server.nodesets", SOON);
+    let told = server.wait_for_line("restart needed for changes of: server.nodesets", SOON);
     assert!(told.contains("another one"), "{told}");
     assert_eq!(read(&cell, "ns=3;i=6000")["value"], json!(0.5));
 

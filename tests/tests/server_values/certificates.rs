@@ -123,7 +123,7 @@ fn a_server_is_connected_to_by_its_authority_and_each_fault_has_its_status_and_i
     is_secured("sound");
     for (name, status, help) in [
         ("gone", "BadCertificateRevoked", "needs another certificate"),
-        ("late", "BadCertificateTimeInvalid", "issued anew"),
+        ("late", "BadCertificateTimeInvalid", "renew the certificate"),
         ("elsewhere", "BadCertificateHostNameInvalid", "192.0.2.7"),
         ("impostor", "BadCertificateUriInvalid", "plc:another"),
         ("stranger", "BadCertificateChainIncomplete", "\"strange\""),
@@ -133,7 +133,11 @@ fn a_server_is_connected_to_by_its_authority_and_each_fault_has_its_status_and_i
     }
     site.server.wait_for_line("BadCertificateRevoked", SOON);
     // The message has the command to trust the server.
-    let told = is_refused("stranger", "BadCertificateChainIncomplete", "alone: `");
+    let told = is_refused(
+        "stranger",
+        "BadCertificateChainIncomplete",
+        "to trust only this certificate: `",
+    );
     let why = told["why"].as_str().unwrap();
     let (_, command) = why.rsplit_once("`ua-server trust ").unwrap();
     let (digits, _) = command.split_once(' ').unwrap();

@@ -449,7 +449,7 @@ server:
     let second = cell.asyncua_started("opcua_programs.py", &second);
     let _second = second.start().ready(SOON);
     register(&cell, urls[1], &uris[1], &["--old"]);
-    says(["no place", &uris[1]]);
+    says(["the limit of server.find_skills.most is reached", &uris[1]]);
     assert_eq!(servers(), [("machine".to_owned(), true)]);
 
     drop(first);
@@ -492,7 +492,7 @@ server:
     // The server has no channel without security; with security, its certificate is not trusted
     // automatically.
     refused("there is no channel without security", &|why| {
-        why.contains("it offers Basic256Sha256/SignAndEncrypt, wanted is None")
+        why.contains("it offers Basic256Sha256/SignAndEncrypt, but None is required")
     });
     fs::write(&file, mapping("Basic256Sha256")).unwrap();
     server.signal(Signal::SIGHUP);

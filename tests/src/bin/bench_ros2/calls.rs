@@ -57,7 +57,7 @@ impl Sum {
         self.seconds += told["seconds"].as_f64().unwrap();
         self.used += used;
         if let Some(why) = told["failed"].get(0) {
-            println!("a call came to nothing: {why}");
+            println!("a call failed: {why}");
         }
     }
 }
