@@ -15,7 +15,6 @@ use crate::redundancy::RoleChange;
 
 /// An action that the Router requests from its caller.
 #[derive(Debug)]
-#[non_exhaustive]
 pub enum Output {
     /// A NetworkMessage to send. Return the buffer with
     /// [`Router::recycle`](crate::Router::recycle).

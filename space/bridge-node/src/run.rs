@@ -491,10 +491,6 @@ impl<P: Port> Shell<P> {
     }
 
     /// Carries out the outputs of the Router, up to a limit; returns whether more may be queued.
-    #[expect(
-        clippy::wildcard_enum_match_arm,
-        reason = "outputs of calls and unknown outputs"
-    )]
     fn drain(&mut self) -> bool {
         for _ in 0..DRAINED_AT_ONCE {
             let Some(output) = self.router.poll_output(now()) else {
@@ -550,7 +546,15 @@ impl<P: Port> Shell<P> {
                     tell(&notice, name);
                 }
                 Output::KeysWanted { group } => self.keys.want(&group),
-                other => self.call_output(other),
+                Output::Action { topic, bytes } => self.send_action(topic, bytes),
+                Output::Answer { ask, topic, answer } => {
+                    self.port.answered(ask, topic, answer.map(Bytes::from));
+                }
+                Output::CallKnown { topic, description } => self.call_known(topic, &description),
+                Output::CallGone { topic } => self.call_gone(topic),
+                Output::Execute(execution) => self.execute(execution),
+                Output::Abandoned { execution, topic } => self.port.abandoned(execution, topic),
+                Output::Taken { namespace, by } => self.taken(namespace, by),
             }
         }
         true

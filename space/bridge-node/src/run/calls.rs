@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use bridge_core::{
-    AskError, AskErrorKind, CallDescription, CallMap, Executed, OfferedType, Output, Refusal,
+    AskError, AskErrorKind, CallDescription, CallMap, Executed, OfferedType, Refusal,
 };
 use bytes::Bytes;
 use mappings::TopicId;
@@ -117,27 +117,8 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// Carries out the outputs of the Router that concern calls and namespaces.
-    #[expect(
-        clippy::wildcard_enum_match_arm,
-        reason = "the caller handles all other outputs"
-    )]
-    pub(super) fn call_output(&mut self, output: Output) {
-        match output {
-            Output::Action { topic, bytes } => self.send_action(topic, bytes),
-            Output::Answer { ask, topic, answer } => {
-                self.port.answered(ask, topic, answer.map(Bytes::from));
-            }
-            Output::CallKnown { topic, description } => self.call_known(topic, &description),
-            Output::CallGone { topic } => self.call_gone(topic),
-            Output::Execute(execution) => self.execute(execution),
-            Output::Abandoned { execution, topic } => self.port.abandoned(execution, topic),
-            Output::Taken { namespace, by } => self.taken(namespace, by),
-            other => debug!(?other, "ignored an unknown output"),
-        }
-    }
-
-    fn send_action(&mut self, topic: TopicId, bytes: Vec<u8>) {
+    /// Sends a request or a response.
+    pub(super) fn send_action(&mut self, topic: TopicId, bytes: Vec<u8>) {
         let message = Outgoing {
             within: self.carrier.within(),
             ..Outgoing::new(&bytes)
@@ -149,7 +130,8 @@ impl<P: Port> Shell<P> {
         self.router.recycle(bytes);
     }
 
-    fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+    /// Passes a call of another program to the port.
+    pub(super) fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         if self.router.redundancy().is_some() {
             debug!(%topic, "a call is not offered on the local side: {NO_CALLS}");
             return;
@@ -159,13 +141,15 @@ impl<P: Port> Shell<P> {
         self.port.call_known(topic, description);
     }
 
-    fn call_gone(&mut self, topic: TopicId) {
+    /// Removes a call of another program from the port.
+    pub(super) fn call_gone(&mut self, topic: TopicId) {
         debug!(%topic, "a program withdrew its call");
         self.observe(|observer| observer.call_gone(topic));
         self.port.call_gone(topic);
     }
 
-    fn execute(&mut self, execution: bridge_core::Execution) {
+    /// Lets the port execute a request.
+    pub(super) fn execute(&mut self, execution: bridge_core::Execution) {
         let bridge_core::Execution {
             id,
             topic,
@@ -186,7 +170,8 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    fn taken(&mut self, namespace: u16, by: Option<std::net::SocketAddr>) {
+    /// Reports a namespace that another program writes, or that is free again.
+    pub(super) fn taken(&mut self, namespace: u16, by: Option<std::net::SocketAddr>) {
         match by {
             Some(by) => {
                 let why = format!(
