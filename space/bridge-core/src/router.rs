@@ -54,15 +54,67 @@ use crate::tap::{Crossing, Tapped};
 
 /// Decides which messages cross between a space and UADP. The crate documentation describes its
 /// use.
+///
+/// The Router wires types that own their state and know each other only downwards: the values of
+/// topics, the reassembly of chunks, announcements and probes, calls, and security. After each
+/// input it plans the probes that values need.
+///
+/// # Inputs
+/// - samples: [`handle_local`](Self::handle_local), [`handle_local_as`](Self::handle_local_as),
+///   [`left`](Self::left), [`set_live`](Self::set_live),
+///   [`handle_datagram`](Self::handle_datagram).
+/// - types and metadata: [`bind`](Self::bind), [`bind_as`](Self::bind_as),
+///   [`unbind`](Self::unbind), [`describe_value`](Self::describe_value),
+///   [`introduce`](Self::introduce), [`call_the_roll`](Self::call_the_roll).
+/// - calls: [`bind_call`](Self::bind_call), [`unbind_call`](Self::unbind_call),
+///   [`want_call`](Self::want_call), [`ask`](Self::ask), [`give_up`](Self::give_up),
+///   [`offer`](Self::offer), [`offer_type`](Self::offer_type), [`withdraw`](Self::withdraw),
+///   [`withdraw_all`](Self::withdraw_all), [`executed`](Self::executed).
+/// - the fate of an output: [`published`](Self::published),
+///   [`not_published`](Self::not_published), [`handed`](Self::handed),
+///   [`call_failed`](Self::call_failed), [`not_sent`](Self::not_sent),
+///   [`not_called`](Self::not_called), [`not_announced`](Self::not_announced),
+///   [`heartbeat_sent`](Self::heartbeat_sent), [`recycle`](Self::recycle).
+/// - losses outside the Router: [`lost`](Self::lost), [`dropped`](Self::dropped),
+///   [`unmatched`](Self::unmatched).
+/// - settings: [`replace_mapping`](Self::replace_mapping), [`set_owned`](Self::set_owned),
+///   [`claim`](Self::claim), [`set_source`](Self::set_source), [`set_relay`](Self::set_relay),
+///   [`set_instance`](Self::set_instance), [`set_keys`](Self::set_keys), [`tap`](Self::tap).
+/// - redundancy: [`set_redundancy`](Self::set_redundancy), [`set_fit`](Self::set_fit),
+///   [`switch_over`](Self::switch_over).
+///
+/// # Outputs
+/// - in their order: [`poll_output`](Self::poll_output).
+/// - steps of tapped topics: [`next_tapped`](Self::next_tapped),
+///   [`take_lost_taps`](Self::take_lost_taps).
+///
+/// # Timers
+/// - the time of the next call, and the call: [`poll_timeout`](Self::poll_timeout),
+///   [`handle_timeout`](Self::handle_timeout).
+///
+/// # Queries
+/// - topics: [`topics`](Self::topics), [`heard`](Self::heard), [`is_full`](Self::is_full),
+///   [`is_state`](Self::is_state), [`is_command`](Self::is_command),
+///   [`is_to_confirm`](Self::is_to_confirm), [`expiry`](Self::expiry),
+///   [`is_tapped`](Self::is_tapped).
+/// - calls and programs: [`calls`](Self::calls), [`described_call`](Self::described_call),
+///   [`applications`](Self::applications).
+/// - the Router: [`mapping`](Self::mapping), [`others`](Self::others), [`hops`](Self::hops),
+///   [`groups`](Self::groups), [`redundancy`](Self::redundancy),
+///   [`muted_samples`](Self::muted_samples).
 #[derive(Debug)]
 pub struct Router {
+    /// Topics with their queues, turns and timers, and outputs about them.
     values: Values,
+    /// Received chunks of large messages.
     reassembly: Reassembly,
+    /// Planned announcements and pending probes.
     announcements: Announcements,
     /// Requested and executed calls; `None` before the first use.
     calls: Option<Box<Calls>>,
     /// Random bytes that distinguish own requests from requests of other programs.
     instance: [u8; 16],
+    /// Secured groups.
     security: Security,
     /// The redundant bridges of other spaces.
     redundant_senders: BTreeMap<SpaceId, ActiveSender>,
