@@ -277,8 +277,8 @@ impl Status {
         self
     }
 
-    /// Returns the number of topics, and the numbers of samples sent, delivered and dropped. Drops of
-    /// normal traffic, such as repetitions, are not counted.
+    /// Returns the number of topics, and the numbers of samples sent, delivered and dropped. Drops
+    /// of normal traffic, such as repetitions, are not counted.
     pub(crate) fn summary(&self) -> [u64; 4] {
         let all = || self.topics.values().chain([&self.others]);
         let routine = Reason::ALL.into_iter().filter(|reason| reason.is_routine());
