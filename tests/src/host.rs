@@ -144,13 +144,17 @@ impl Cable {
     /// Panics if there is no cable.
     #[must_use]
     pub fn ua_side(&self) -> UaSide {
-        std::thread::scope(|scope| {
-            let joined = scope.spawn(|| {
-                setns(&self.there.0, CloneFlags::CLONE_NEWNET).unwrap();
-                UaSide::on(UadpSocket::join_on(THERE.parse().unwrap()))
-            });
-            joined.join().unwrap()
-        })
+        UaSide::on(self.socket())
+    }
+
+    /// Creates a socket in the UADP group on the other host, which works while the cable lies.
+    ///
+    /// # Panics
+    /// Panics if there is no cable.
+    #[must_use]
+    pub fn socket(&self) -> UadpSocket {
+        self.there
+            .within(|| UadpSocket::join_on(THERE.parse().unwrap()))
     }
 }
 

@@ -114,22 +114,44 @@ pub fn overflowed(socket: &UdpSocket) -> Option<u64> {
     let inode = link.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?;
     udp_sockets()?
         .into_iter()
-        .find_map(|(of, dropped)| (of == inode).then_some(dropped))
+        .find_map(|socket| (socket.inode == inode).then_some(socket.dropped))
 }
 
 /// Returns the number of datagrams dropped because of full buffers, summed over all UDP sockets of
-/// this thread's network.
+/// this thread's network. It includes the own datagrams of programs in [`GROUP`], which their
+/// filters drop.
 #[must_use]
 pub fn all_overflowed() -> Option<u64> {
-    Some(udp_sockets()?.into_iter().map(|(_, dropped)| dropped).sum())
+    let dropped = udp_sockets()?.into_iter().map(|socket| socket.dropped);
+    Some(dropped.sum())
 }
 
-/// Returns inode and drops of each socket: columns 10 and 13 of `/proc/net/udp` of Linux.
-fn udp_sockets() -> Option<Vec<(String, u64)>> {
+/// Returns the number of [`all_overflowed`] without the members of [`GROUP`].
+#[must_use]
+pub fn overflowed_outside_group() -> Option<u64> {
+    let sockets = udp_sockets()?.into_iter();
+    let others = sockets.filter(|socket| socket.port != GROUP.port());
+    Some(others.map(|socket| socket.dropped).sum())
+}
+
+/// A row of `/proc/net/udp` of Linux.
+struct SocketRow {
+    port: u16,
+    inode: String,
+    dropped: u64,
+}
+
+/// Returns the UDP sockets of this thread's network: columns 2, 10 and 13 of the table.
+fn udp_sockets() -> Option<Vec<SocketRow>> {
     let table = std::fs::read_to_string("/proc/thread-self/net/udp").ok()?;
     let rows = table.lines().skip(1).map(|row| {
-        let mut words = row.split_whitespace().skip(9);
-        Some((words.next()?.to_owned(), words.last()?.parse().ok()?))
+        let mut words = row.split_whitespace();
+        let (_, port) = words.nth(1)?.split_once(':')?;
+        Some(SocketRow {
+            port: u16::from_str_radix(port, 16).ok()?,
+            inode: words.nth(7)?.to_owned(),
+            dropped: words.last()?.parse().ok()?,
+        })
     });
     rows.collect()
 }

@@ -47,7 +47,7 @@ fn run<T>(future: impl Future<Output = T>) -> T {
 /// Returns the next `count` datagrams of a WriterGroup of the publisher.
 fn published(cell: &Cell, writer_group: u16, count: usize) -> Vec<Vec<u8>> {
     run(async {
-        let group = group();
+        let mut group = group();
         let url = format!("opc.udp://{GROUP}");
         let publisher = cell.asyncua_started("uadp_publish.py", &[&url]);
         let _publisher = publisher.start();

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use broker::{Identity, Mqtt};
 use mappings::{Broker, BrokerAddress, MqttVersion, PubSub};
-use system_tests::{BROKER, Cell, Child, Peer};
+use system_tests::{BROKER, Cell, Child, GROUP, HERE, Peer, UadpSocket, WIRE};
 use tokio::time::timeout;
 use transport::{BUFFER, Carrier, Options, Outgoing, SendError, Udp};
 use uadp::{
@@ -297,3 +297,100 @@ fn mqtt_3_1_1_conforms() {
 fn mqtt_5_conforms() {
     mosquitto_conforms(MqttVersion::V5);
 }
+
+/// Returns the datagrams that a carrier receives from another host, up to `last`. Fails for an own
+/// datagram.
+async fn from_others(carrier: &mut Udp, last: &[u8]) -> Vec<Vec<u8>> {
+    let mut buffer = vec![0; BUFFER];
+    let mut datagrams = Vec::new();
+    let own = carrier.source().port();
+    let all = async {
+        loop {
+            let carrier: &mut dyn Carrier = carrier;
+            let received = carrier.recv(&mut buffer).await.unwrap();
+            assert_ne!(received.from.port(), own, "an own datagram");
+            let datagram = buffer[..received.length].to_vec();
+            let is_last = datagram == last;
+            datagrams.push(datagram);
+            if is_last {
+                return;
+            }
+        }
+    };
+    timeout(SOON, all).await.expect("the last datagram arrives");
+    datagrams
+}
+
+/// Returns datagrams of unequal sizes, the last of them small. Some of them are fragmented by a
+/// network with an MTU of 1500. All of them fit the usual receive buffer of 208 KiB.
+fn burst() -> Vec<Vec<u8>> {
+    let sizes = (0..20).map(|number| match number % 10 {
+        0 => 60_000,
+        1 => 1_472,
+        2 => 1_473,
+        _ => 100 + number,
+    });
+    let datagrams = sizes.zip(0..).map(|(size, number)| vec![number; size]);
+    datagrams.chain([b"last".to_vec()]).collect()
+}
+
+/// Sends a burst in both directions of a cable, and expects no own datagram.
+async fn exchange(here: &mut Udp, there: &UadpSocket) {
+    let burst = burst();
+    let messages: Vec<Outgoing<'_>> = burst.iter().map(|of| Outgoing::new(of)).collect();
+    let errors = Carrier::try_send_all(here, &messages);
+    assert!(errors.is_empty(), "{errors:?}");
+    for datagram in &burst {
+        let received = there.receive(SOON).expect("each datagram arrives");
+        assert!(received == *datagram, "{} bytes", received.len());
+    }
+    for datagram in &burst {
+        there.send(datagram);
+    }
+    assert!(from_others(here, b"last").await == burst);
+    // The other host is a member too.
+    for datagram in &burst {
+        assert!(there.receive(SOON).as_ref() == Some(datagram));
+    }
+}
+
+#[test]
+fn bursts_of_fragmented_datagrams_cross_a_cable_without_echo() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let cable = cell.cable();
+    cable.lay(HERE);
+    cable.route();
+    let there = cable.socket();
+    run(async {
+        for interface in [Some(WIRE.to_owned()), None] {
+            let options = Options {
+                interface,
+                ..Options::new(GROUP.into())
+            };
+            let mut here = Udp::open(&options).unwrap();
+            exchange(&mut here, &there).await;
+        }
+        // The address of the host changes.
+        let mut here = Udp::open(&Options::new(GROUP.into())).unwrap();
+        let new = format!("{NEW_ADDRESS}/24");
+        let old = format!("{HERE}/24");
+        for args in [
+            &["address", "delete", &old, "dev", WIRE][..],
+            &["address", "add", &new, "dev", WIRE],
+        ] {
+            assert!(Command::new("ip").args(args).status().unwrap().success());
+        }
+        cable.route();
+        until(SOON, || {
+            here.follow();
+            here.interface() == WIRE && here.lost().is_none()
+        })
+        .await;
+        exchange(&mut here, &there).await;
+    });
+}
+
+/// Another address of this host on the cable.
+const NEW_ADDRESS: &str = "10.77.0.9";

@@ -83,7 +83,7 @@ async fn watch_page(mut reader: Reader, port: u16, facts: mpsc::Sender<Dated>) {
     }
 }
 
-async fn listen(udp: Udp, facts: mpsc::Sender<Dated>) {
+async fn listen(mut udp: Udp, facts: mpsc::Sender<Dated>) {
     let mut buffer = vec![0; MOST_BYTES];
     let mut heard = Vec::new();
     while heard.len() < Part::ALL.len() {

@@ -34,7 +34,7 @@ use crate::observer::Observer;
 use crate::port::Port;
 use crate::redundancy;
 use crate::restart;
-use crate::run::{Fixed, Shell, relay};
+use crate::run::{Fixed, Outbox, Shell, relay};
 use crate::service;
 use crate::service_manager;
 use crate::signals;
@@ -353,6 +353,7 @@ async fn prepare<P: Program>(
         held: port.addresses().and_then(Held::start),
         port,
         carrier,
+        outbox: Outbox::default(),
         owned: P::owned,
         claims: P::CLAIMS,
         requests,

@@ -2,6 +2,7 @@
 
 mod awaited;
 mod calls;
+mod outbox;
 mod redundancy;
 mod taps;
 
@@ -26,6 +27,7 @@ use uadp::Timestamp;
 
 use crate::awaited::PeerWatch;
 use crate::busy_poll::BusyPoll;
+use crate::carrier::NO_SOURCE;
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
 use crate::keys::{self, KeyRing, NewKeys};
@@ -36,6 +38,9 @@ use crate::policy::NO_SUBSCRIBER;
 use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, RedundancyStatus, Status};
 use crate::tap::Taps;
+
+pub(crate) use outbox::Outbox;
+use outbox::Parcel;
 
 /// The run loop of one space, with its Router, port and carrier, and the requests for the status.
 pub(crate) struct Shell<P> {
@@ -48,6 +53,8 @@ pub(crate) struct Shell<P> {
     pub(crate) router: Router,
     pub(crate) port: P,
     pub(crate) carrier: Box<dyn Carrier>,
+    /// The datagrams to send together.
+    pub(crate) outbox: Outbox,
     /// The network interfaces that the port cannot change while it runs.
     pub(crate) held: Option<Held>,
     /// Returns the namespaces that only this program writes, by the mapping.
@@ -494,28 +501,34 @@ impl<P: Port> Shell<P> {
     fn drain(&mut self) -> bool {
         for _ in 0..DRAINED_AT_ONCE {
             let Some(output) = self.router.poll_output(now()) else {
+                self.flush();
                 return false;
             };
+            if !matches!(output, Output::Datagram { .. }) {
+                self.flush();
+            }
             match output {
                 Output::Datagram { topic, with, bytes } => {
-                    let message = Outgoing {
-                        bytes: &bytes,
+                    let parcel = Parcel {
                         replaceable: with.is_empty() && self.router.is_state(topic),
                         command: self.router.is_command(topic),
                         within: self.router.expiry(topic),
+                        topic,
+                        with,
+                        bytes,
                     };
-                    if let Err(error) = self.send(&message) {
-                        let (reason, detail) = (not_sent(error), error.to_string());
-                        for topic in std::iter::once(topic).chain(with) {
-                            self.router.not_sent(topic, reason, &detail);
-                        }
-                    }
-                    self.router.recycle(bytes);
+                    self.post(parcel);
                 }
                 Output::Discovery { bytes } => {
-                    if let Err(error) = self.send(&Outgoing::new(&bytes)) {
-                        self.router
-                            .not_announced(not_sent(error), &error.to_string());
+                    match self.send(&Outgoing::new(&bytes)) {
+                        // The network does not return own datagrams.
+                        Ok(()) => {
+                            let from = self.carrier.source().unwrap_or(NO_SOURCE);
+                            self.observe(|observer| observer.datagram(&bytes, from));
+                        }
+                        Err(error) => self
+                            .router
+                            .not_announced(not_sent(error), &error.to_string()),
                     }
                     self.router.recycle(bytes);
                 }
@@ -557,6 +570,7 @@ impl<P: Port> Shell<P> {
                 Output::Taken { namespace, by } => self.taken(namespace, by),
             }
         }
+        self.flush();
         true
     }
 

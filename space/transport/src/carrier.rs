@@ -1,5 +1,6 @@
 //! The interface of a PubSub network, such as UDP multicast or an MQTT broker.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::future::poll_fn;
 use std::io;
@@ -21,6 +22,16 @@ pub trait Carrier: fmt::Debug + Send {
     /// # Errors
     /// A [`SendError`]; later messages may be sent nevertheless.
     fn try_send(&mut self, message: &Outgoing<'_>) -> Result<(), SendError>;
+
+    /// Sends messages in their order without waiting, with as few system calls as possible. Returns
+    /// the errors of the messages that were not sent, by their index.
+    fn try_send_all(&mut self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+        let sent = messages.iter().map(|message| self.try_send(message));
+        let errors = sent
+            .enumerate()
+            .filter_map(|(index, sent)| Some((index, sent.err()?)));
+        errors.collect()
+    }
 
     /// Polls for a message. It is written to the start of `buffer`, which grows if needed and must
     /// hold at least [`BUFFER`] bytes. No message is lost if the result is not awaited.
@@ -157,20 +168,20 @@ impl Carrier for Udp {
         Self::try_send(self, message.bytes)
     }
 
+    fn try_send_all(&mut self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+        Self::try_send_all(self, messages)
+    }
+
     fn poll_recv(
         &mut self,
         cx: &mut Context<'_>,
         buffer: &mut Vec<u8>,
     ) -> Poll<io::Result<Received>> {
-        self.poll_datagram(cx, buffer)
-            .map_ok(|(length, from)| Received { length, from })
+        self.poll_datagram(cx, |batch| batch.take(buffer))
     }
 
     fn try_recv(&mut self, buffer: &mut Vec<u8>) -> Option<io::Result<Received>> {
-        match Self::try_recv(self, buffer) {
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => None,
-            received => Some(received.map(|(length, from)| Received { length, from })),
-        }
+        self.try_datagram(|batch| batch.take(buffer))
     }
 
     fn follow(&mut self) -> Option<CarrierChange> {

@@ -5,7 +5,9 @@
 //! group (or a unicast address) on a network interface. As in OPC 10000-14, 7.3.2 (UADP over UDP),
 //! the address is used for receiving and sending.
 
+mod batch;
 mod carrier;
+mod filter;
 mod interface;
 mod udp;
 mod watch;

@@ -1,14 +1,20 @@
 //! A UDP socket for a multicast group or a unicast address.
 
+use std::collections::BTreeMap;
+use std::future::poll_fn;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::task::{Context, Poll};
+use std::os::fd::AsRawFd as _;
+use std::task::{Context, Poll, ready};
 
 use socket2::{Domain, Protocol, Socket, Type};
-use tokio::io::ReadBuf;
+use tokio::io::Interest;
 use tokio::net::UdpSocket;
 use tracing::info;
 
+use crate::batch::{self, Batch};
+use crate::carrier::{Outgoing, Received};
+use crate::filter::OwnFilter;
 use crate::interface::{Interface, InterfaceError, interfaces};
 use crate::watch::{Change, Wanted, Watch};
 
@@ -17,13 +23,19 @@ use crate::watch::{Change, Wanted, Watch};
 pub struct Udp {
     receiver: UdpSocket,
     /// Sends from a separate port, so that several processes of a host can share the port of the
-    /// group and distinguish each other by source address.
-    sender: UdpSocket,
+    /// group and distinguish each other by source address. It is not registered with tokio: no task
+    /// waits for it, and each sent datagram would wake the program once more, because it makes the
+    /// socket writable again.
+    sender: std::net::UdpSocket,
     targets: Vec<SocketAddr>,
     local: SocketAddr,
     options: Options,
     /// Interface of the sockets; `None` if the interface does not have to be watched.
     watch: Option<Watch>,
+    /// Received datagrams that were not yet taken.
+    batch: Batch,
+    /// Drops own datagrams; `None` if own datagrams are received.
+    own_filter: Option<OwnFilter>,
 }
 
 /// Addresses and options of a [`Udp`].
@@ -41,6 +53,9 @@ pub struct Options {
     pub ttl: u32,
     /// True if other processes of this host receive the datagrams that are sent to the group.
     pub loopback: bool,
+    /// True if own datagrams are received too. False lets the kernel drop them, if it can: own
+    /// datagrams may nevertheless be received, for example after a change of the network.
+    pub own: bool,
     /// Size of the receive buffer in bytes. The system may grant less, which is logged.
     pub receive_buffer: usize,
     /// Unicast addresses to send to instead of `address`, for networks without multicast.
@@ -110,8 +125,8 @@ pub enum SendError {
 }
 
 impl Options {
-    /// Returns the default options for `address`: TTL 1, multicast loopback, 4 MiB receive buffer,
-    /// no peers.
+    /// Returns the default options for `address`: TTL 1, multicast loopback without own datagrams,
+    /// 4 MiB receive buffer, no peers.
     #[must_use]
     pub const fn new(address: SocketAddr) -> Self {
         Self {
@@ -119,6 +134,7 @@ impl Options {
             interface: None,
             ttl: 1,
             loopback: true,
+            own: false,
             receive_buffer: 4 << 20,
             peers: Vec::new(),
         }
@@ -157,6 +173,12 @@ impl Udp {
         } else {
             options.peers.clone()
         };
+        let own_filter = (!options.own).then(|| {
+            let mut filter = OwnFilter::default();
+            // The addresses that cannot be listed at present are added by `follow`.
+            filter.set(&receiver, local, &interfaces().unwrap_or_default());
+            filter
+        });
         Ok(Self {
             receiver,
             sender,
@@ -164,6 +186,8 @@ impl Udp {
             local,
             options: options.clone(),
             watch: options.wanted().and_then(Watch::start),
+            batch: Batch::default(),
+            own_filter,
         })
     }
 
@@ -172,17 +196,30 @@ impl Udp {
     /// [`source`](Self::source) may change, and received datagrams that were not yet taken are
     /// lost.
     pub fn follow(&mut self) -> Option<Change> {
+        // If the system cannot list its interfaces, their state is unknown.
+        let present = interfaces().ok()?;
         let (options, receiver) = (&self.options, &self.receiver);
         let mut made = None;
-        let change = self.watch.as_mut()?.look(|interface| {
-            made = Some(anew(options, receiver, interface).map_err(|error| error.to_string())?);
-            Ok(())
+        let change = self.watch.as_mut().and_then(|watch| {
+            watch.see(&present, |interface| {
+                made = Some(anew(options, receiver, interface).map_err(|error| error.to_string())?);
+                Ok(())
+            })
         });
+        let is_new = made.is_some();
         if let Some((receiver, (sender, local))) = made {
             if let Some(receiver) = receiver {
                 self.receiver = receiver;
             }
             (self.sender, self.local) = (sender, local);
+            self.batch.clear();
+        }
+        if let Some(filter) = &mut self.own_filter {
+            if is_new {
+                filter.set(&self.receiver, self.local, &present);
+            } else {
+                filter.update(&self.receiver, self.local, &present);
+            }
         }
         change
     }
@@ -212,28 +249,47 @@ impl Udp {
     ///
     /// # Errors
     /// The error of the system; the socket stays usable.
-    pub async fn recv(&self, buffer: &mut [u8]) -> io::Result<(usize, SocketAddr)> {
-        self.receiver.recv_from(buffer).await
+    pub async fn recv(&mut self, buffer: &mut [u8]) -> io::Result<(usize, SocketAddr)> {
+        let received = poll_fn(|cx| self.poll_datagram(cx, |batch| batch.copy(buffer))).await?;
+        Ok((received.length, received.from))
     }
 
-    /// Polls for a datagram, as [`recv`](Self::recv).
+    /// Polls for a datagram, which `take` takes from the received datagrams.
     pub(crate) fn poll_datagram(
-        &self,
+        &mut self,
         cx: &mut Context<'_>,
-        buffer: &mut [u8],
-    ) -> Poll<io::Result<(usize, SocketAddr)>> {
-        let mut buffer = ReadBuf::new(buffer);
-        self.receiver
-            .poll_recv_from(cx, &mut buffer)
-            .map_ok(|from| (buffer.filled().len(), from))
+        mut take: impl FnMut(&mut Batch) -> Option<Received>,
+    ) -> Poll<io::Result<Received>> {
+        loop {
+            if let Some(received) = self.try_datagram(&mut take) {
+                return Poll::Ready(received);
+            }
+            ready!(self.receiver.poll_recv_ready(cx))?;
+        }
     }
 
-    /// Returns a datagram that was already received.
-    ///
-    /// # Errors
-    /// `WouldBlock` if there is none.
-    pub fn try_recv(&self, buffer: &mut [u8]) -> io::Result<(usize, SocketAddr)> {
-        self.receiver.try_recv_from(buffer)
+    /// Returns a datagram that was already received, or `None`. `take` takes it from the received
+    /// datagrams.
+    pub(crate) fn try_datagram(
+        &mut self,
+        mut take: impl FnMut(&mut Batch) -> Option<Received>,
+    ) -> Option<io::Result<Received>> {
+        if let Some(received) = take(&mut self.batch) {
+            return Some(Ok(received));
+        }
+        let (batch, socket) = (&mut self.batch, self.receiver.as_raw_fd());
+        let filled = self.receiver.try_io(Interest::READABLE, || {
+            // `WouldBlock` clears the readiness: no datagram waits behind a batch that is not
+            // full, and a call that finds nothing is saved.
+            match batch.fill(socket)? {
+                true => Ok(()),
+                false => Err(io::ErrorKind::WouldBlock.into()),
+            }
+        });
+        match filled {
+            Err(error) if error.kind() != io::ErrorKind::WouldBlock => Some(Err(error)),
+            _ => take(&mut self.batch).map(Ok),
+        }
     }
 
     /// Sends a datagram to the group (or to each peer) without waiting.
@@ -243,8 +299,8 @@ impl Udp {
     pub fn try_send(&self, datagram: &[u8]) -> Result<(), SendError> {
         let mut result = Ok(());
         for target in &self.targets {
-            // Bypasses the readiness of tokio: a datagram socket is nearly always writable, and a
-            // full buffer is reported as an error.
+            // A datagram socket is nearly always writable, and a full buffer is reported as an
+            // error.
             let sent = socket2::SockRef::from(&self.sender).send_to(datagram, &(*target).into());
             if let Err(error) = sent
                 && result.is_ok()
@@ -253,6 +309,25 @@ impl Udp {
             }
         }
         result
+    }
+
+    /// Sends messages as [`try_send`](Self::try_send), several in one system call. Returns the first
+    /// [`SendError`] of each message that was not sent to all targets, by its index.
+    pub(crate) fn try_send_all(&self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
+        let mut errors = BTreeMap::new();
+        for target in &self.targets {
+            let mut sent = 0;
+            while let Some(rest @ [_, ..]) = messages.get(sent..) {
+                match batch::send(&self.sender, *target, rest) {
+                    Ok(count) => sent += count.max(1),
+                    Err(error) => {
+                        errors.entry(sent).or_insert_with(|| send_error(&error));
+                        sent += 1;
+                    }
+                }
+            }
+        }
+        errors
     }
 
     /// Returns the source address of sent datagrams as known before sending. The IP address may be
@@ -275,7 +350,7 @@ impl Options {
     }
 }
 
-type Sender = (UdpSocket, SocketAddr);
+type Sender = (std::net::UdpSocket, SocketAddr);
 
 /// Returns new sockets for a changed interface. A receiver that is bound to a present address is
 /// kept, because its port cannot be bound twice.
@@ -456,7 +531,7 @@ fn sender(options: &Options, interface: Option<&Interface>) -> Result<Sender, Op
     socket
         .bind(&SocketAddr::from((from, 0)).into())
         .map_err(at("bind the sender"))?;
-    let socket = UdpSocket::from_std(socket.into()).map_err(at("register the socket"))?;
+    let socket = std::net::UdpSocket::from(socket);
     let local = socket.local_addr().map_err(at("read the local address"))?;
     Ok((socket, local))
 }
@@ -465,122 +540,4 @@ fn sender(options: &Options, interface: Option<&Interface>) -> Result<Sender, Op
 const SEND_BUFFER: usize = 1 << 20;
 
 #[cfg(test)]
-mod tests {
-    use std::time::Duration;
-
-    use super::*;
-
-    fn on_loopback(address: &str) -> Options {
-        Options {
-            interface: Some("127.0.0.1".into()),
-            ttl: 0,
-            ..Options::new(address.parse().unwrap())
-        }
-    }
-
-    fn run<T>(future: impl Future<Output = T>) -> T {
-        let runtime = tokio::runtime::Builder::new_current_thread()
-            .enable_all()
-            .build()
-            .unwrap();
-        runtime.block_on(async {
-            tokio::time::timeout(Duration::from_secs(5), future)
-                .await
-                .expect("in time")
-        })
-    }
-
-    /// Returns an unused port. Multicast ports are shared, so each test needs a separate group.
-    fn free_port() -> u16 {
-        std::net::UdpSocket::bind("127.0.0.1:0")
-            .unwrap()
-            .local_addr()
-            .unwrap()
-            .port()
-    }
-
-    #[test]
-    fn every_member_of_the_group_hears_a_datagram_with_its_sender() {
-        run(async {
-            let options = on_loopback(&format!("239.255.40.1:{}", free_port()));
-            let (a, b) = (Udp::open(&options).unwrap(), Udp::open(&options).unwrap());
-            a.try_send(b"cover").unwrap();
-            for member in [&a, &b] {
-                let mut buffer = [0; 64];
-                let (len, from) = member.recv(&mut buffer).await.unwrap();
-                assert_eq!((&buffer[..len], from), (&b"cover"[..], a.source()));
-            }
-        });
-    }
-
-    #[test]
-    fn unicast_peers_get_what_the_group_would() {
-        run(async {
-            let listener = Udp::open(&on_loopback(&format!("127.0.0.1:{}", free_port()))).unwrap();
-            let mut options = on_loopback(&format!("239.255.40.2:{}", free_port()));
-            options.peers = vec![listener.receiver.local_addr().unwrap()];
-            Udp::open(&options).unwrap().try_send(b"1").unwrap();
-            let mut buffer = [0; 8];
-            assert_eq!(listener.recv(&mut buffer).await.unwrap().0, 1);
-        });
-    }
-
-    #[test]
-    fn with_another_hosts_unicast_address_its_port_is_listened_at_here() {
-        run(async {
-            let port = free_port();
-            // A documentation address, which is not assigned to any host; nothing is sent to it.
-            let udp = Udp::open(&on_loopback(&format!("203.0.113.7:{port}"))).unwrap();
-            let other = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
-            other.send_to(b"cover", ("127.0.0.1", port)).unwrap();
-            let mut buffer = [0; 8];
-            let (len, from) = udp.recv(&mut buffer).await.unwrap();
-            assert_eq!(
-                (&buffer[..len], from),
-                (&b"cover"[..], other.local_addr().unwrap())
-            );
-            assert_eq!(udp.targets, [SocketAddr::from(([203, 0, 113, 7], port))]);
-        });
-    }
-
-    #[test]
-    fn a_port_that_is_not_shared_is_named() {
-        run(async {
-            let holder = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
-            let address = holder.local_addr().unwrap();
-            let error = Udp::open(&on_loopback(&address.to_string())).unwrap_err();
-            assert!(
-                matches!(&error, OpenError::PortTaken(at) if *at == address),
-                "{error}"
-            );
-            assert!(
-                error.to_string().contains(&address.port().to_string()),
-                "{error}"
-            );
-        });
-    }
-
-    #[test]
-    fn a_datagram_too_big_is_refused_and_the_next_one_goes() {
-        run(async {
-            let udp = Udp::open(&on_loopback(&format!("239.255.40.3:{}", free_port()))).unwrap();
-            assert_eq!(udp.try_send(&vec![0; 70_000]), Err(SendError::TooBig));
-            udp.try_send(b"small").unwrap();
-            let mut buffer = [0; 16];
-            assert_eq!(udp.recv(&mut buffer).await.unwrap().0, 5);
-        });
-    }
-
-    #[test]
-    fn a_missing_interface_is_an_error_that_lists_the_present_ones() {
-        run(async {
-            let mut options = on_loopback("239.255.40.4:4840");
-            options.interface = Some("nosuch0".into());
-            let error = Udp::open(&options).unwrap_err().to_string();
-            assert!(
-                error.contains("nosuch0") && error.contains("127.0.0.1"),
-                "{error}"
-            );
-        });
-    }
-}
+mod tests;

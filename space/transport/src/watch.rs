@@ -62,17 +62,9 @@ impl Watch {
         &self.held
     }
 
-    /// Checks the interfaces. If the watched interface is present and has changed, `take` recreates
-    /// the sockets. A failure is retried at the next poll.
-    pub(crate) fn look(
-        &mut self,
-        take: impl FnOnce(&Interface) -> Result<(), String>,
-    ) -> Option<Change> {
-        // If the system cannot list its interfaces, their state is unknown.
-        self.see(&interfaces().ok()?, take)
-    }
-
-    fn see(
+    /// Checks the present interfaces. If the watched interface is present and has changed, `take`
+    /// recreates the sockets. A failure is retried at the next poll.
+    pub(crate) fn see(
         &mut self,
         present: &[Interface],
         take: impl FnOnce(&Interface) -> Result<(), String>,

@@ -5,8 +5,8 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use system_tests::{
-    Cell, GROUP, METRICS_ROS2, Stamp, UaSide, all_overflowed, drops, eventually, group_member,
-    metrics, now, overflowed, per_message, processor_time,
+    Cell, GROUP, METRICS_ROS2, Stamp, UaSide, drops, eventually, group_member, metrics, now,
+    overflowed, overflowed_outside_group, per_message, processor_time,
 };
 use uadp::{NetworkMessage, Scalar};
 
@@ -147,7 +147,7 @@ impl Dropped {
         Self {
             by_bridge: drops(&bridge),
             in_receiver,
-            in_others: all_overflowed().unwrap_or_default() - in_receiver,
+            in_others: overflowed_outside_group().unwrap_or_default(),
         }
     }
 

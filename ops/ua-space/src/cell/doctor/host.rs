@@ -111,9 +111,10 @@ async fn round_trip(group: IpAddr, interface: &str) -> Result<f64, String> {
     let options = Options {
         interface: Some(interface.to_owned()),
         ttl: 0,
+        own: true,
         ..Options::new(SocketAddr::new(group, port))
     };
-    let udp = Udp::open(&options).map_err(|error| error.to_string())?;
+    let mut udp = Udp::open(&options).map_err(|error| error.to_string())?;
     let sent = format!("ua-space doctor {} {interface}", std::process::id());
     let start = Instant::now();
     udp.try_send(sent.as_bytes())

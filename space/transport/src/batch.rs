@@ -1,0 +1,140 @@
+//! System calls that receive or send several datagrams.
+
+use std::cell::RefCell;
+use std::fmt;
+use std::io::{self, IoSlice, IoSliceMut};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::os::fd::{AsFd, RawFd};
+
+use nix::sys::socket::{MsgFlags, MultiHeaders, SockaddrIn, recvmmsg};
+use rustix::net::{MMsgHdr, SendAncillaryBuffer, SendFlags, SocketAddrAny, sendmmsg};
+
+use crate::carrier::{BUFFER, Outgoing, Received};
+
+/// The maximum number of datagrams of a system call.
+pub(crate) const AT_ONCE: usize = 32;
+
+thread_local! {
+    /// The headers of a receiving call. They refer to memory only during the call.
+    static HEADERS: RefCell<MultiHeaders<SockaddrIn>> =
+        RefCell::new(MultiHeaders::preallocate(AT_ONCE, None));
+}
+
+/// The datagrams of a receiving call that were not yet taken.
+pub(crate) struct Batch {
+    buffers: Box<[Vec<u8>; AT_ONCE]>,
+    received: [Received; AT_ONCE],
+    count: usize,
+    taken: usize,
+}
+
+impl fmt::Debug for Batch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Batch")
+            .field("count", &self.count)
+            .field("taken", &self.taken)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        let nothing = Received {
+            length: 0,
+            from: SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0)),
+        };
+        Self {
+            buffers: Box::new([const { Vec::new() }; AT_ONCE]),
+            received: [nothing; AT_ONCE],
+            count: 0,
+            taken: 0,
+        }
+    }
+}
+
+impl Batch {
+    /// Receives the datagrams that wait in the socket, after all received datagrams were taken.
+    /// Returns whether more may wait: a full batch does not show that the socket is empty.
+    ///
+    /// # Errors
+    /// The error of the system; `WouldBlock` if no datagram waits.
+    pub(crate) fn fill(&mut self, socket: RawFd) -> io::Result<bool> {
+        (self.count, self.taken) = (0, 0);
+        for buffer in self.buffers.iter_mut().filter(|of| of.len() < BUFFER) {
+            buffer.resize(BUFFER, 0);
+        }
+        let (buffers, places) = (&mut self.buffers, &mut self.received);
+        let count = HEADERS.with_borrow_mut(|headers| {
+            let mut slices = buffers.each_mut().map(|buffer| [IoSliceMut::new(buffer)]);
+            let (slices, flags) = (slices.iter_mut(), MsgFlags::MSG_DONTWAIT);
+            let mut count = 0;
+            for (message, place) in
+                recvmmsg(socket, headers, slices, flags, None)?.zip(places.iter_mut())
+            {
+                let from = message.address.map(SocketAddr::from);
+                *place = Received {
+                    length: message.bytes,
+                    from: from.unwrap_or(place.from),
+                };
+                count += 1;
+            }
+            io::Result::Ok(count)
+        })?;
+        self.count = count;
+        Ok(count == AT_ONCE)
+    }
+
+    /// Takes the next datagram: `buffer` is exchanged for the buffer of the datagram.
+    pub(crate) fn take(&mut self, buffer: &mut Vec<u8>) -> Option<Received> {
+        let (next, received) = self.next()?;
+        std::mem::swap(next, buffer);
+        Some(received)
+    }
+
+    /// Copies the next datagram, which is truncated to the size of `buffer`.
+    pub(crate) fn copy(&mut self, buffer: &mut [u8]) -> Option<Received> {
+        let (next, mut received) = self.next()?;
+        received.length = received.length.min(buffer.len());
+        let to = buffer.get_mut(..received.length)?;
+        to.copy_from_slice(next.get(..received.length)?);
+        Some(received)
+    }
+
+    fn next(&mut self) -> Option<(&mut Vec<u8>, Received)> {
+        if self.taken >= self.count {
+            return None;
+        }
+        let next = self.taken;
+        self.taken += 1;
+        Some((self.buffers.get_mut(next)?, *self.received.get(next)?))
+    }
+
+    /// Drops the datagrams that were not yet taken.
+    pub(crate) const fn clear(&mut self) {
+        self.taken = self.count;
+    }
+}
+
+/// Sends up to [`AT_ONCE`] messages to one target. Returns the number of sent messages, which is
+/// smaller if the system refuses the message behind them.
+///
+/// # Errors
+/// The error of the system for the first message.
+pub(crate) fn send(
+    socket: impl AsFd,
+    target: SocketAddr,
+    messages: &[Outgoing<'_>],
+) -> io::Result<usize> {
+    let target = SocketAddrAny::from(target);
+    let bytes = messages.iter().take(AT_ONCE).map(|message| message.bytes);
+    let slices: Vec<[IoSlice<'_>; 1]> = bytes.map(|bytes| [IoSlice::new(bytes)]).collect();
+    let mut controls: Vec<SendAncillaryBuffer<'_, '_, '_>> = slices
+        .iter()
+        .map(|_| SendAncillaryBuffer::default())
+        .collect();
+    let headers = slices.iter().zip(&mut controls);
+    let mut headers: Vec<MMsgHdr<'_>> = headers
+        .map(|(slice, control)| MMsgHdr::new_with_addr(&target, slice, control))
+        .collect();
+    Ok(sendmmsg(socket, &mut headers, SendFlags::DONTWAIT)?)
+}
