@@ -55,7 +55,7 @@ pub use judge::Judge;
 pub use mosquitto::BROKER;
 pub use net::{
     GROUP, UadpSocket, all_overflowed, group_member, http_answer, http_get, metrics, overflowed,
-    xml_rpc,
+    overflowed_outside_group, xml_rpc,
 };
 pub use numbered::{Numbered, numbered};
 pub use peers::MASTER;
@@ -68,5 +68,5 @@ pub use rtps::{Mutator, announced, claims_too_much, queued};
 pub use stamp::{Stamp, now};
 pub use times::{Times, micros, per_message, processor_time};
 pub use ua_side::{Triple, UaSide};
-pub use usage::{anonymous, cpu_share, peak, resident, threads};
+pub use usage::{SystemCalls, anonymous, cpu_share, peak, resident, threads, wake_ups};
 pub use wait::{eventually, holds_for};

@@ -72,3 +72,54 @@ fn cpu_time(process: u32) -> Duration {
         .sum();
     Duration::from_millis(ticks * 10)
 }
+
+/// Returns how often the threads of a process went to sleep and were woken, over its living
+/// threads.
+#[must_use]
+pub fn wake_ups(process: u32) -> u64 {
+    let threads = fs::read_dir(format!("/proc/{process}/task"));
+    let threads = threads.into_iter().flatten().flatten();
+    let counts = threads.filter_map(|thread| {
+        // A thread may end between the listing and the read.
+        let text = fs::read_to_string(thread.path().join("status")).ok()?;
+        let line = |line: &str| {
+            let count = line.strip_prefix("voluntary_ctxt_switches:")?;
+            count.trim().parse::<u64>().ok()
+        };
+        text.lines().find_map(line)
+    });
+    counts.sum()
+}
+
+/// Counts the system calls of a process with `perf stat`, which hardly slows it down.
+pub struct SystemCalls(std::process::Child);
+
+impl SystemCalls {
+    /// Starts to count. Returns `None` if `perf` cannot be started, or may not count.
+    #[must_use]
+    pub fn count(process: u32) -> Option<Self> {
+        let mut perf = std::process::Command::new("perf")
+            .args(["stat", "-x", ",", "-e", "raw_syscalls:sys_enter", "-p"])
+            .arg(process.to_string())
+            .stdout(std::process::Stdio::null())
+            .stderr(std::process::Stdio::piped())
+            .spawn()
+            .ok()?;
+        // It has no sign that it counts; it ends at once if it may not.
+        std::thread::sleep(Duration::from_millis(300));
+        matches!(perf.try_wait(), Ok(None)).then_some(Self(perf))
+    }
+
+    /// Stops, and returns the number of calls.
+    #[must_use]
+    pub fn stop(self) -> Option<u64> {
+        let pid = nix::unistd::Pid::from_raw(i32::try_from(self.0.id()).ok()?);
+        nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGINT).ok()?;
+        let output = self.0.wait_with_output().ok()?;
+        let report = String::from_utf8(output.stderr).ok()?;
+        report.lines().find_map(|line| {
+            let (count, rest) = line.split_once(',')?;
+            rest.contains("sys_enter").then(|| count.parse().ok())?
+        })
+    }
+}

@@ -18,6 +18,7 @@ mod dds_peers;
 mod discovery;
 mod dissector;
 mod doctor;
+mod idle;
 mod init;
 mod interfaces;
 mod knowledge;

@@ -175,28 +175,31 @@ impl Master {
     }
 
     pub(crate) async fn graph(&self) -> Result<Graph, MasterError> {
-        let state = self.registrations().await?;
-        let types = self.call("getTopicTypes", vec![]).await?;
+        const TYPES: &str = "getTopicTypes";
+        let requests = vec![(STATE, vec![]), (TYPES, vec![])];
+        let (state, types) = match self.call_all(requests).await {
+            Ok(replies) => {
+                let mut replies = replies.into_iter();
+                let mut next = |method| replies.next().ok_or(MasterError::Shape(method))?;
+                (next(STATE)?, next(TYPES)?)
+            }
+            // Each half of a very large graph may be small enough for a reply.
+            Err(MasterError::Rpc(RpcError::Body(_))) => (
+                self.call(STATE, vec![]).await?,
+                self.call(TYPES, vec![]).await?,
+            ),
+            Err(error) => return Err(error),
+        };
         let text = |value: &Value| value.as_str().map(str::to_owned);
         Ok(Graph {
-            types: pairs(&types, text).ok_or(MasterError::Shape("getTopicTypes"))?,
-            ..state
+            types: pairs(&types, text).ok_or(MasterError::Shape(TYPES))?,
+            ..registrations(&state)?
         })
     }
 
     /// Reads the graph without the types.
     pub(crate) async fn registrations(&self) -> Result<Graph, MasterError> {
-        let state = self.call("getSystemState", vec![]).await?;
-        let [publishers, subscribers, services, ..] = state.as_array().unwrap_or_default() else {
-            return Err(MasterError::Shape("getSystemState"));
-        };
-        let by_topic = |value| pairs(value, strings).ok_or(MasterError::Shape("getSystemState"));
-        Ok(Graph {
-            publishers: by_topic(publishers)?,
-            subscribers: by_topic(subscribers)?,
-            services: by_topic(services)?,
-            types: BTreeMap::new(),
-        })
+        registrations(&self.call(STATE, vec![]).await?)
     }
 
     /// Returns the name of the publisher of a topic with this URI. Checks only a few publishers,
@@ -277,6 +280,20 @@ impl Master {
     }
 }
 
+/// Decodes the reply to `getSystemState`: the graph without the types.
+fn registrations(state: &Value) -> Result<Graph, MasterError> {
+    let [publishers, subscribers, services, ..] = state.as_array().unwrap_or_default() else {
+        return Err(MasterError::Shape(STATE));
+    };
+    let by_topic = |value| pairs(value, strings).ok_or(MasterError::Shape(STATE));
+    Ok(Graph {
+        publishers: by_topic(publishers)?,
+        subscribers: by_topic(subscribers)?,
+        services: by_topic(services)?,
+        types: BTreeMap::new(),
+    })
+}
+
 /// Unwraps a reply of a multicall: its result in an array of its own, or a struct with a fault.
 fn unwrap_one((reply, method): (Value, &'static str)) -> Result<Value, MasterError> {
     let Value::Array(result) = reply else {
@@ -345,6 +362,7 @@ fn pairs<T>(value: &Value, second: impl Fn(&Value) -> Option<T>) -> Option<BTree
     value.as_array()?.iter().map(pair).collect()
 }
 
+const STATE: &str = "getSystemState";
 const MULTICALL: &str = "system.multicall";
 const CALL_LIMIT: Duration = Duration::from_secs(3);
 
@@ -417,6 +435,24 @@ mod tests {
             matches!(results.as_slice(), [Ok(_), Err(MasterError::Refused { message, .. })] if message == "no"),
             "{results:?}"
         );
+        assert_eq!(*asked.lock().unwrap(), ["system.multicall"]);
+    }
+
+    #[tokio::test]
+    async fn the_graph_is_read_with_one_request() {
+        let (master, asked, _tasks) = master(|_| {
+            let list = |items: Vec<Value>| Value::Array(items);
+            let entry = list(vec!["/a".into(), list(vec!["/node".into()])]);
+            let state = list(vec![list(vec![entry]), list(vec![]), list(vec![])]);
+            let types = list(vec![list(vec!["/a".into(), "std_msgs/Bool".into()])]);
+            let answers = [state, types]
+                .map(|result| list(vec![list(vec![Value::Int(1), "".into(), result])]));
+            Ok(list(answers.to_vec()))
+        })
+        .await;
+        let graph = master.graph().await.unwrap();
+        assert_eq!(graph.publishers.get("/a").unwrap(), &["/node"]);
+        assert_eq!(graph.types.get("/a").unwrap(), "std_msgs/Bool");
         assert_eq!(*asked.lock().unwrap(), ["system.multicall"]);
     }
 

@@ -19,7 +19,7 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
-use tokio::time::{MissedTickBehavior, interval};
+use tokio::time::sleep;
 use tracing::{error, info, warn};
 use type_files::{Environment, TypeFiles, TypePaths};
 
@@ -354,16 +354,16 @@ impl MappingFile {
     /// handful of system calls, and it is needed anyway to wait until a file is written completely.
     /// There may be thousands of definitions, so each poll checks a bounded number of them in turn.
     pub(crate) async fn follow(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
-        let mut looks = interval(LOOK);
-        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut pause = Duration::ZERO;
         let mut before = Before::default();
         let mut turn = 0_usize;
         let mut again = None;
         loop {
             let asked = tokio::select! {
                 Some(()) = hangup.recv() => true,
-                _ = looks.tick(), if self.file.is_some() => false,
+                () = sleep(pause), if self.file.is_some() => false,
             };
+            pause = LOOK;
             let Some(file) = self.file.clone() else {
                 if asked {
                     info!("ignored SIGHUP: this program runs without a mapping");
@@ -392,6 +392,9 @@ impl MappingFile {
             }
             let Some(reading) = looked.reading else {
                 before = looked.before;
+                if !self.gone && before.is_unchanged(&self.files) {
+                    pause = IDLE_LOOK;
+                }
                 continue;
             };
             // A file that cannot be read is reported once.
@@ -584,11 +587,14 @@ fn seconds() -> i64 {
     seconds.try_into().unwrap_or(i64::MAX)
 }
 
-/// Interval of the polls. A file with the same stamp in two polls is written completely.
+/// Interval of the polls after a change. A file with the same stamp in two polls is written
+/// completely.
 const LOOK: Duration = Duration::from_millis(250);
-/// After this number of polls, ten seconds, folders of definitions that could not be listed are
-/// read again, even if their stamps are unchanged.
-const AGAIN: usize = 40;
+/// Interval of the polls while nothing changes. Each poll wakes the program three times.
+const IDLE_LOOK: Duration = Duration::from_secs(1);
+/// After this number of polls, ten seconds at most, folders of definitions that could not be listed
+/// are read again, even if their stamps are unchanged.
+const AGAIN: usize = 10;
 /// The maximal number of faulty definitions logged at a time; further faults usually have the same
 /// cause.
 const MOST_TOLD: usize = 10;

@@ -77,6 +77,13 @@ pub(super) struct Before {
     pub(super) types: Option<(Stamps, usize)>,
 }
 
+impl Before {
+    /// Returns whether the last poll found all files as they were read.
+    pub(super) fn is_unchanged(&self, files: &Seen) -> bool {
+        self.mapping.as_ref() == Some(&files.mapping) && self.types.is_none()
+    }
+}
+
 /// The result of a poll of the files.
 #[derive(Debug, Default)]
 pub(super) struct Looked {
@@ -186,9 +193,9 @@ impl Look {
 const SLOW: Duration = Duration::from_secs(5);
 /// After this number of polls, five seconds, definitions that keep changing are read as they are.
 const PATIENCE: usize = 20;
-/// The maximal number of definition files and folders checked in each poll: about 1000 a second, at
-/// a microsecond or two each.
-const LOOKED_AT_ONCE: usize = 256;
+/// The maximal number of definition files and folders checked in each poll: about 1000 a second
+/// while nothing changes, at a microsecond or two each.
+const LOOKED_AT_ONCE: usize = 1024;
 
 #[cfg(test)]
 mod tests {
@@ -255,6 +262,21 @@ mod tests {
     impl Drop for Looks {
         fn drop(&mut self) {
             std::fs::remove_dir_all(&self.folder).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_poll_reports_whether_all_files_are_as_they_were_read() {
+        for file in ["cell.yaml", "types/my_msgs/msg/Arm.msg"] {
+            let mut looks = Looks::new(file.split_once('.').unwrap().1);
+            for _ in 0..2 {
+                let looked = looks.look(false);
+                assert!(looked.before.is_unchanged(&looks.files), "{file}");
+                looks.before = looked.before;
+            }
+            looks.write(file, "# being written");
+            let looked = looks.look(false);
+            assert!(!looked.before.is_unchanged(&looks.files), "{file}");
         }
     }
 
