@@ -46,6 +46,7 @@ cargo xtask <verb>
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
+  bench work [ARGS]              count system calls, wake-ups and CPU of both bridges per message, and of idle programs (perf)
   bench opcua [ARGS]             measure ua-server beside servers of asyncua and node-opcua, and what comes from the space to clients
   bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding)
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
@@ -88,6 +89,10 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["bench", "messages", rest @ ..] => bench::messages(&Workspace::find()?, rest),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
         ["bench", "ros1", rest @ ..] => bench::ros1(&Workspace::find()?, rest),
+        ["bench", "work", rest @ ..] => {
+            let arguments = [&["work"], rest].concat();
+            bench::ros2(&Workspace::find()?, &arguments)
+        }
         ["bench", "opcua", rest @ ..] => bench::opcua(&Workspace::find()?, rest),
         ["bench", "skills", rest @ ..] => bench::skills(&Workspace::find()?, rest),
         ["bench", "ros2", rest @ ..] => bench::ros2(&Workspace::find()?, rest),

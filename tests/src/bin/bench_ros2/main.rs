@@ -15,6 +15,7 @@ mod many;
 mod relays;
 mod sealed;
 mod through;
+mod work;
 
 use std::process::ExitCode;
 
@@ -48,9 +49,11 @@ fn main() -> ExitCode {
     if plan.has("many") {
         many::measure(&cell, plan.seconds);
     }
-    if ["through", "sealed", "bursts", "floods", "calls", "goals"]
-        .iter()
-        .any(|part| plan.has(part))
+    if [
+        "through", "sealed", "bursts", "floods", "calls", "goals", "work",
+    ]
+    .iter()
+    .any(|part| plan.has(part))
     {
         let _core = cell.roscore();
         if plan.has("through") {
@@ -61,6 +64,9 @@ fn main() -> ExitCode {
         }
         if plan.has("bursts") {
             bursts::measure(&cell, plan.turns);
+        }
+        if plan.has("work") {
+            work::measure(&cell, plan.seconds);
         }
         if plan.has("calls") {
             calls::measure(&cell, plan.calls);
@@ -134,7 +140,7 @@ impl Plan {
 
 /// Each flood takes seconds.
 const FLOODS: u64 = 3;
-const PARTS: [&str; 11] = [
+const PARTS: [&str; 12] = [
     "round-trip",
     "throughput",
     "joining",
@@ -146,6 +152,7 @@ const PARTS: [&str; 11] = [
     "floods",
     "calls",
     "goals",
+    "work",
 ];
 
 const HELP: &str = "\
@@ -154,5 +161,5 @@ bench-ros2 [--quick] [--seconds N] [--turn N] [PART..]
   --quick      a trial of a minute; its figures are no measurement
   --seconds N  how long each path gets messages at 1 kHz, 20 unless told
   --turn N     samples through one relay before the next has its turn, 50 unless told
-  PART         round-trip, throughput, joining, idle, many, through, sealed, bursts, floods, calls, goals; all unless told
+  PART         round-trip, throughput, joining, idle, many, through, sealed, bursts, floods, calls, goals, work; all unless told
 ";

@@ -135,6 +135,12 @@ impl Ways {
         })
     }
 
+    /// Returns both bridges, first the bridge of ROS 1.
+    pub(crate) const fn bridges(&self) -> [&Child; 2] {
+        let [ros1, ros2] = &self.bridges;
+        [ros1, ros2]
+    }
+
     pub(crate) fn used(&self, way: usize) -> Duration {
         if way == 0 {
             return processor_time(self.relay.id());
