@@ -3,8 +3,7 @@
 use std::time::Duration;
 
 use serde_json::Value;
-use system_tests::{Cell, METRICS_ROS1, Peer, UaSide, UadpSocket, eventually, metrics, number};
-use uadp::Scalar;
+use system_tests::{Cell, Peer, UadpSocket, eventually};
 
 const SOON: Duration = Duration::from_secs(30);
 const BOTH: &[Peer] = &[Peer::Ros1, Peer::Python];
@@ -65,14 +64,6 @@ fn an_echoing_ros_1_node_makes_no_loop() {
     echo.wait_for_json("it echoes the topic of ROS 2", SOON, |line| {
         (line["echoed"] == "/ua_2_5_10").then_some(())
     });
-
-    // The rule is applied to datagrams of other programs; the kernel drops own datagrams.
-    let mut forger = UaSide::join();
-    eventually("the bridge drops a value of its own space", SOON, || {
-        forger.write((1, 5, 99), Scalar::Boolean(true));
-        (number(&metrics(METRICS_ROS1)?, "space_taken") > 0).then_some(())
-    });
-    drop(forger);
 
     drop((of_ros1, of_ros2));
     let group = UadpSocket::join();
