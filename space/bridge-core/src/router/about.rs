@@ -24,6 +24,13 @@ impl About {
         }
     }
 
+    pub(super) const fn message(topic: TopicId, from: SocketAddr) -> Self {
+        Self {
+            topic: Some(topic),
+            from: Some(from),
+        }
+    }
+
     pub(super) const fn sender(from: SocketAddr) -> Self {
         Self {
             topic: None,

@@ -402,7 +402,10 @@ impl Announcements {
                         values.deny(writer_id, number);
                     }
                 }
-                _ => {}
+                Subject::PubSubConnections
+                | Subject::WriterGroupConfiguration(_)
+                | Subject::DataSetWriterConfiguration(_)
+                | Subject::ActionResponder => {}
             }
         }
         for (space, ids) in self.probes.poll(at) {

@@ -66,11 +66,12 @@ impl Claims {
 
     /// Removes the free namespaces, and returns each with whether another program had taken it.
     pub(super) fn poll(&mut self, silence: Duration, now: Instant) -> Vec<(u16, bool)> {
-        let free = self
-            .of
-            .extract_if(.., |_, claim| claim.ends(silence) <= now);
-        free.map(|(namespace, claim)| (namespace, matches!(claim, Claim::Taken { .. })))
-            .collect()
+        let is_free = |claim: &Claim| claim.ends(silence) <= now;
+        let free = self.of.iter().filter(|(_, claim)| is_free(claim));
+        let free = free.map(|(of, claim)| (*of, matches!(claim, Claim::Taken { .. })));
+        let free: Vec<(u16, bool)> = free.collect();
+        self.of.retain(|_, claim| !is_free(claim));
+        free
     }
 }
 

@@ -206,7 +206,14 @@ impl Router {
                 }
                 self.learn_value((*writer_id, *status), meta_data, (space, from), now);
             }
-            _ => self.values.drop_undecoded(None, from, &DISCOVERY),
+            Announced::PublisherEndpoints { .. }
+            | Announced::DataSetWriterConfiguration { .. }
+            | Announced::PubSubConnections(_)
+            | Announced::PubSubConnection { .. }
+            | Announced::ApplicationStatus { .. }
+            | Announced::ActionResponder(_) => {
+                self.values.drop_undecoded(None, from, &DISCOVERY);
+            }
         }
     }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use mappings::{PublisherIdRule, SpaceId, TopicId};
 use uadp::{
-    DataSetHeader, DataSetMessage, DecodeError, Fields, MessageKind, NetworkHeader, NetworkMessage,
+    DataSetMessage, DecodeError, Fields, MessageKind, NetworkHeader, NetworkMessage,
     NetworkMessageType, Timestamp,
 };
 
@@ -112,26 +112,34 @@ impl Router {
             self.handle_chunk(message, (space, namespace), from, now);
             return;
         }
-        let sent = sent(&header);
+        self.handle_values(message, (space, namespace), from, now);
+    }
+
+    /// Handles the DataSetMessages of a message of another space.
+    fn handle_values(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        (space, namespace): (SpaceId, u16),
+        from: SocketAddr,
+        now: Now,
+    ) {
+        let about = About::sender(from);
+        let sent = sent(&message.header());
         for message in message.messages() {
-            match message {
-                Ok(message) => {
-                    let writer_id = message.writer_id.unwrap_or_default();
-                    let id = TopicId::new(u16::from(space.get()), namespace, writer_id);
-                    match id {
-                        Some(topic) => {
-                            self.values
-                                .handle_message(topic, &message, (from, sent), now)
-                        }
-                        None => self.values.count(
-                            About::sender(from),
-                            Reason::NotInSpace,
-                            1,
-                            String::new,
-                        ),
-                    }
+            let message = match message {
+                Ok(message) => message,
+                Err(error) => {
+                    self.values.drop_undecoded(None, from, &error);
+                    continue;
                 }
-                Err(error) => self.values.drop_undecoded(None, from, &error),
+            };
+            let writer_id = message.writer_id.unwrap_or_default();
+            match TopicId::new(u16::from(space.get()), namespace, writer_id) {
+                Some(topic) => {
+                    self.values
+                        .handle_message(topic, &message, (from, sent), now);
+                }
+                None => self.values.count(about, Reason::NotInSpace, 1, String::new),
             }
         }
     }
@@ -216,10 +224,7 @@ impl Values {
         (from, sent): (SocketAddr, Option<Timestamp>),
         now: Now,
     ) {
-        let about = About {
-            topic: Some(topic),
-            from: Some(from),
-        };
+        let about = About::message(topic, from);
         self.tap.note(topic, || Crossing::Received {
             from,
             sequence: message.sequence_number(),
@@ -230,10 +235,7 @@ impl Values {
                 "the writer marked its DataSetMessage as invalid".to_owned()
             });
         }
-        let mut place = place(&message.header(), (from, sent));
-        // Only key frames are repeated.
-        place.fine &= message.kind == MessageKind::KeyFrame;
-        place.by_clients = topic.space == SpaceId::UA;
+        let mut place = place(topic, message, (from, sent));
         let local = self.settings.local;
         let relay = self.relay;
         let took_over = self.took_over();
@@ -593,18 +595,24 @@ pub(super) fn sent(header: &NetworkHeader<'_>) -> Option<Timestamp> {
     })
 }
 
-fn place(header: &DataSetHeader, (from, sent): (SocketAddr, Option<Timestamp>)) -> Place {
+fn place(
+    topic: TopicId,
+    message: &DataSetMessage<'_>,
+    (from, sent): (SocketAddr, Option<Timestamp>),
+) -> Place {
+    let header = message.header();
     Place {
         sequence: header.sequence_number,
         stamp: header.timestamp.map(|time| Timestamp {
             time,
             picoseconds: header.picoseconds.unwrap_or_default(),
         }),
-        fine: header.picoseconds.is_some(),
+        // Only key frames are repeated.
+        fine: header.picoseconds.is_some() && message.kind == MessageKind::KeyFrame,
         sent,
         from,
         held_back: Duration::ZERO,
-        by_clients: false,
+        by_clients: topic.space == SpaceId::UA,
     }
 }
 
