@@ -311,8 +311,8 @@ impl Udp {
         result
     }
 
-    /// Sends messages as [`try_send`](Self::try_send), several in one system call. Returns the first
-    /// [`SendError`] of each message that was not sent to all targets, by its index.
+    /// Sends messages as [`try_send`](Self::try_send), several in one system call. Returns the
+    /// first [`SendError`] of each message that was not sent to all targets, by its index.
     pub(crate) fn try_send_all(&self, messages: &[Outgoing<'_>]) -> BTreeMap<usize, SendError> {
         let mut errors = BTreeMap::new();
         for target in &self.targets {
