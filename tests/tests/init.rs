@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use mappings::Mapping;
+use mappings::{ExecutedBy, Mapping};
 use serde_json::Value;
 use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, Started, eventually, program};
 
@@ -76,6 +76,36 @@ fn settled(args: &[&str], wanted: &str) {
     eventually(wanted, SOON, || {
         ua_space(args).text().contains(wanted).then_some(())
     });
+}
+
+#[test]
+fn a_model_gives_the_topics_that_another_parser_counts() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let model = test_data::own("sysml/line.uml").display().to_string();
+    let judged = cell.asyncua_once("sysml_judge.py", &[&model]);
+    let file = path(&cell, "of-model.yaml");
+    let name = file.to_str().unwrap();
+    let ended = ua_space(&["init", "--model", &model, "-o", name, "--json"]);
+    assert_eq!(ended.code, 0, "{}", ended.text());
+    let sum = ended.object();
+    assert_eq!(sum["variables"], judged[0]["properties"], "{sum}");
+    assert_eq!(sum["calls"], judged[0]["calls"], "{sum}");
+    let text = fs::read_to_string(&file).unwrap();
+    let mapping = Mapping::from_yaml(&text, name).mapping.unwrap();
+    let bindings = mapping.variables().iter().flat_map(|one| &one.bindings);
+    let topics = bindings.map(|binding| binding.ros_topic.clone());
+    let calls = mapping
+        .calls()
+        .iter()
+        .filter_map(|call| match &call.executed {
+            ExecutedBy::Ros(target) => Some(target.name.clone()),
+            ExecutedBy::OpcUa(_) | ExecutedBy::Elsewhere => None,
+        });
+    let mut names: Vec<String> = topics.chain(calls).collect();
+    names.sort();
+    assert_eq!(Value::from(names), judged[0]["names"]);
 }
 
 #[test]

@@ -50,8 +50,9 @@ pub(crate) enum Verb {
     Check(Check),
     /// Propose a mapping of running robots and servers
     ///
-    /// Inspects ROS graphs, running OPC UA servers and NodeSets, or all discovered sources, and
-    /// writes a commented mapping that runs. Topics and nodes of several sources with the same name
+    /// Inspects SysML models, ROS graphs, running OPC UA servers and NodeSets, or all discovered
+    /// sources, and writes a commented mapping that runs. A model has a stereotype at each property
+    /// that crosses (ua-space new profile, ua-space new sysml). Topics and nodes of several sources with the same name
     /// and type are joined, and marked as guesses. Topics of ROS itself (logs, actions, transforms)
     /// are left out, with a comment.
     ///
@@ -59,7 +60,7 @@ pub(crate) enum Verb {
     /// that its comments name are not proposed again, unless this command commented them out
     /// because a definition was missing.
     ///
-    /// Exit codes: 0 done, 64 usage, 65 a NodeSet is malformed, 69 a master, domain or server is
+    /// Exit codes: 0 done, 64 usage, 65 a NodeSet or model is malformed, 69 a master, domain or server is
     /// not available, 74 a file cannot be read or written, or exists and --merge is missing, 78 the
     /// existing file cannot run.
     Init(Init),
@@ -442,6 +443,9 @@ pub(crate) struct Init {
     /// A NodeSet file of a modelling tool. May be repeated
     #[arg(long, value_name = "FILE")]
     pub(crate) nodeset: Vec<String>,
+    /// A SysML model: the .uml file of Papyrus, or SysML v2 text. May be repeated
+    #[arg(long, value_name = "FILE")]
+    pub(crate) model: Vec<String>,
     /// A running OPC UA server, as opc.tcp://127.0.0.1:4840. May be repeated
     #[arg(long, value_name = "URL")]
     pub(crate) opcua: Vec<String>,

@@ -1,4 +1,4 @@
-//! `ua-space init`: proposes a mapping from live graphs, servers and NodeSets.
+//! `ua-space init`: proposes a mapping from live graphs, servers, NodeSets and SysML models.
 
 mod calls;
 mod known;
@@ -24,6 +24,7 @@ use crate::arguments::Init;
 use crate::discover::{self, Kind};
 use crate::exit::Failure;
 use crate::report;
+use crate::survey::model::Model;
 use crate::survey::{self, Graph, Nodes, look};
 use known::Known;
 use plan::{Plan, Wishes};
@@ -34,11 +35,13 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
         arguments.ros2.is_empty(),
         arguments.nodeset.is_empty(),
         arguments.opcua.is_empty(),
+        arguments.model.is_empty(),
         !arguments.discover,
     ];
     if asked.iter().all(|nothing| *nothing) {
         return Err(Failure::Usage(
-            "nothing to look at: give one or several of --ros1, --ros2, --nodeset FILE, --opcua URL, --discover"
+            "nothing to look at: give one or several of --ros1, --ros2, --nodeset FILE, --model FILE, \
+             --opcua URL, --discover"
                 .to_owned(),
         ));
     }
@@ -55,7 +58,13 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
         namespace: &arguments.namespace,
         transforms: arguments.tf,
     };
-    let mut plan = Plan::new(&found.graphs, &found.nodes, &wishes, &mut known);
+    let mut plan = Plan::new(
+        &found.models,
+        &found.graphs,
+        &found.nodes,
+        &wishes,
+        &mut known,
+    );
     let file = arguments.output.as_deref().unwrap_or_default();
     let text = match &existing {
         Some((mapping, text)) => added(file, (text, mapping), &mut plan)?,
@@ -71,6 +80,7 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
 
 /// The inspected sources.
 struct Found {
+    models: Vec<Model>,
     graphs: Vec<Graph>,
     nodes: Vec<Nodes>,
     /// The names of the sources for the head of the file, in order.
@@ -80,10 +90,16 @@ struct Found {
 impl Found {
     fn look(arguments: &Init, known: &Mapping) -> Result<Self, Failure> {
         let mut found = Self {
+            models: Vec::new(),
             graphs: Vec::new(),
             nodes: Vec::new(),
             places: Vec::new(),
         };
+        for file in &arguments.model {
+            let model = survey::model::survey(file)?;
+            found.places.push(model.place.clone());
+            found.models.push(model);
+        }
         if let Some(uri) = &arguments.ros1 {
             let uri = uri.clone().unwrap_or_else(survey::ros1::master_uri);
             let live = look(survey::ros1::survey(&uri))?;

@@ -35,6 +35,10 @@ pub(crate) fn new(arguments: &New) -> Result<(), Failure> {
         Template::Component => format!("ua-component --check {name}"),
         Template::Mes => format!("ua-mes --check {name}"),
         Template::Mapping => format!("ua-space check {name}"),
+        Template::Sysml => format!("ua-space init --model {name}"),
+        Template::Profile => {
+            "apply it to a model in Papyrus, and then ua-space init --model MODEL.uml".to_owned()
+        }
     };
     warn(&format!("{name} is written; next: {next}"));
     Ok(())
@@ -48,6 +52,8 @@ const fn text(template: Template, driver: DriverTemplate) -> &'static str {
         (Template::Component, DriverTemplate::Http) => include_str!("new/component-http.yaml"),
         (Template::Mes, _) => include_str!("new/mes.yaml"),
         (Template::Mapping, _) => include_str!("new/mapping.yaml"),
+        (Template::Sysml, _) => include_str!("new/ua-bridge.sysml"),
+        (Template::Profile, _) => include_str!("new/ua-bridge.profile.uml"),
     }
 }
 

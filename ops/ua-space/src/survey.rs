@@ -1,6 +1,7 @@
-//! Inspects ROS graphs, OPC UA servers and NodeSets for `init` and `check --environment`.
+//! Inspects ROS graphs, OPC UA servers, NodeSets and SysML models for `init` and `check --environment`.
 
 pub(crate) mod data_types;
+pub(crate) mod model;
 pub(crate) mod nodeset;
 pub(crate) mod opcua;
 pub(crate) mod ros1;

@@ -1,5 +1,5 @@
-//! Data for tests. The project's own data is in this folder: manifests of modules, NodeSets and
-//! definitions of a robot that exist only here. Third-party data is a peer: it has its own
+//! Data for tests. The project's own data is in this folder: manifests of modules, NodeSets, models
+//! and definitions of a robot that exist only here. Third-party data is a peer: it has its own
 //! licences, is no part of the project, and may be missing.
 #![expect(
     clippy::panic,

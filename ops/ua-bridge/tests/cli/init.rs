@@ -163,3 +163,43 @@ fn without_a_file_the_mapping_is_the_output() {
         [("ns=2;i=7".to_owned(), "ua_0_2_7".to_owned())]
     );
 }
+
+#[test]
+fn the_starting_model_becomes_a_mapping_that_has_no_findings() {
+    let model = fresh("start.sysml");
+    assert_eq!(run(&["new", "sysml", "-o", &model]).code, 0);
+    let out = fresh("of-model.yaml");
+    let ended = run(&["init", "--model", &model, "-o", &out]);
+    assert_eq!(ended.code, 0, "{}", ended.stderr);
+    let checked = run(&["check", &out]);
+    assert_eq!(checked.code, 0, "{}{}", checked.stdout, checked.stderr);
+    assert_eq!(
+        topics(&fs::read_to_string(&out).unwrap()),
+        [
+            ("ns=2;i=10".to_owned(), "ua_1_2_10".to_owned()),
+            ("ns=2;i=12".to_owned(), "ua_0_2_12".to_owned())
+        ]
+    );
+    let before = fs::read_to_string(&out).unwrap();
+    run(&["init", "--model", &model, "-o", &out, "--merge"]).quiet();
+    assert_eq!(fs::read_to_string(&out).unwrap(), before);
+}
+
+#[test]
+fn a_faulty_model_is_reported_with_its_lines_and_writes_nothing() {
+    let model = file(
+        "faulty.sysml",
+        "part line {\n  attribute a { @Ros1Topic { topik = \"/a\"; } }\n}\n",
+    );
+    let out = fresh("of-faulty.yaml");
+    let ended = run(&["init", "--model", &model, "-o", &out]);
+    assert_eq!(ended.code, 65, "{}", ended.stderr);
+    for said in [
+        ":2: Ros1Topic has no `topik`; did you mean `topic`?",
+        ":2: Ros1Topic needs `topic`",
+        ":2: Ros1Topic needs `type`",
+    ] {
+        assert!(ended.stderr.contains(said), "{said} in {}", ended.stderr);
+    }
+    assert!(!Path::new(&out).exists());
+}

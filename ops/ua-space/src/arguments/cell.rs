@@ -79,4 +79,8 @@ pub(crate) enum Template {
     Mes,
     /// A mapping with three values, for the bridges and ua-server
     Mapping,
+    /// A SysML v2 model with two values, and the metadata for `ua-space init --model`
+    Sysml,
+    /// The UML profile of the stereotypes for `ua-space init --model`, for Papyrus
+    Profile,
 }

@@ -8,6 +8,7 @@ use mappings::{CallKind, ExecutedBy, Mapping, NodeIdText, ServiceRole, SpaceId, 
 use super::known::Known;
 use super::topics::camel;
 use super::yaml::{comment, scalar, wrapped};
+use crate::survey::model::{Model, ModelCall};
 use crate::survey::{Graph, Nodes, UaMethod};
 
 /// A proposed call.
@@ -56,10 +57,35 @@ impl Candidate {
             Executor::Ros(CallKind::Service, ..) | Executor::Method { .. } => 1,
         }
     }
+
+    /// Returns true if both are the same service or action.
+    pub(super) fn is_same(&self, other: &Self) -> bool {
+        match (&self.what, &other.what) {
+            (Executor::Ros(kind, name, _), Executor::Ros(other_kind, other_name, _)) => {
+                self.origin == other.origin && kind == other_kind && name == other_name
+            }
+            _ => false,
+        }
+    }
 }
 
 /// Services without a unique type, by space.
 pub(super) type Untyped = BTreeMap<SpaceId, BTreeSet<String>>;
+
+/// Returns the calls of the models that are not in `known`, in order.
+pub(super) fn modelled(models: &[Model], known: &Known) -> Vec<Candidate> {
+    let calls = models.iter().flat_map(|model| &model.calls);
+    let new = calls.filter(|call| {
+        let names = Names::of(&known.mapping, call.origin);
+        !names.has(call.kind, &call.server) && !known.mentions(&call.server)
+    });
+    let candidate = |call: &ModelCall| Candidate {
+        name: call.name.clone(),
+        origin: call.origin,
+        what: Executor::Ros(call.kind, call.server.clone(), call.type_name.clone()),
+    };
+    new.map(candidate).collect()
+}
 
 /// Returns the calls of `graphs` and `nodes` that are not in `known`, in order.
 pub(super) fn candidates(

@@ -248,6 +248,12 @@ impl Known {
         }
     }
 
+    /// Returns true if a variable has the name.
+    pub(super) fn has_name(&self, name: &str) -> bool {
+        let mut variables = self.mapping.variables().iter();
+        variables.any(|variable| variable.name == name)
+    }
+
     /// Returns true if a comment names the topic.
     pub(super) fn mentions(&self, topic: &str) -> bool {
         self.mentioned.contains(topic)

@@ -34,42 +34,65 @@ impl Indexes {
         let variables = source.variables.iter();
         let used: HashSet<u16> = variables.map(|one| one.node.namespace).collect();
         let mut indexes = HashMap::new();
-        // The search continues from the wanted index upwards, then from 2. Indexes are never
-        // released, so earlier positions are not free.
-        let (mut above, mut below) = (0, 2);
+        let mut free = Free::default();
         for (index, uri) in (0..=u16::MAX).zip(&source.namespaces).skip(1) {
             if !used.contains(&index) {
                 continue;
             }
-            let given = self.by_uri.get(uri).copied().or_else(|| {
-                let wanted = match &source.server {
-                    None => index.saturating_add(1),
-                    Some(server) if server.is_cell => index,
-                    Some(_) => index.max(2),
-                };
-                let free = |at: &u16| !self.all.contains_key(at);
-                above = wanted.max(above);
-                let found = match (above..=u16::MAX).find(free) {
-                    Some(found) => {
-                        above = found;
-                        found
-                    }
-                    None => {
-                        above = u16::MAX;
-                        below = (below..=u16::MAX).find(free)?;
-                        below
-                    }
-                };
-                self.all.insert(found, uri.clone());
-                self.by_uri.insert(uri.clone(), found);
-                self.given.insert(found, uri.clone());
-                Some(found)
-            });
-            if let Some(given) = given {
+            let wanted = match &source.server {
+                None => index.saturating_add(1),
+                Some(server) if server.is_cell => index,
+                Some(_) => index.max(2),
+            };
+            if let Some(given) = self.index_of(uri, wanted, &mut free) {
                 indexes.insert(index, given);
             }
         }
         indexes
+    }
+
+    /// Returns the index of the namespace: its index in the mapping, or a free index, preferably
+    /// `wanted`. `None` if no index is free.
+    pub(super) fn index_of(&mut self, uri: &str, wanted: u16, free: &mut Free) -> Option<u16> {
+        if let Some(known) = self.by_uri.get(uri) {
+            return Some(*known);
+        }
+        let found = free.next(wanted, &self.all)?;
+        self.all.insert(found, uri.to_owned());
+        self.by_uri.insert(uri.to_owned(), found);
+        self.given.insert(found, uri.to_owned());
+        Some(found)
+    }
+}
+
+/// A search for free indexes. It continues from the wanted index upwards, then from 2. Indexes are
+/// never released, so earlier positions are not free.
+pub(super) struct Free {
+    above: u16,
+    below: u16,
+}
+
+impl Default for Free {
+    fn default() -> Self {
+        Self { above: 0, below: 2 }
+    }
+}
+
+impl Free {
+    fn next(&mut self, wanted: u16, all: &BTreeMap<u16, String>) -> Option<u16> {
+        let free = |at: &u16| !all.contains_key(at);
+        self.above = wanted.max(self.above);
+        match (self.above..=u16::MAX).find(free) {
+            Some(found) => {
+                self.above = found;
+                Some(found)
+            }
+            None => {
+                self.above = u16::MAX;
+                self.below = (self.below..=u16::MAX).find(free)?;
+                Some(self.below)
+            }
+        }
     }
 }
 

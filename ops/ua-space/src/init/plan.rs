@@ -1,7 +1,9 @@
 //! Plans a mapping of the inspected sources: joins topics and nodes, and leaves out topics of ROS
 //! itself.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+mod models;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use mappings::{LiveTopic, NodeIdText, SpaceId};
 use messages::{Registry, TypeName};
@@ -11,6 +13,7 @@ use super::calls::{self, CallEntry, Executor, Untyped};
 use super::known::{Known, Named, Whose};
 use super::nodes::{Indexes, is_at, is_same, source_of};
 use super::topics::{Form, LeftOut, camel, normal, registry};
+use crate::survey::model::Model;
 use crate::survey::{Graph, Nodes, UaServer, UaSource, UaVariable};
 
 /// The contents of the mapping, in order.
@@ -70,8 +73,10 @@ pub(super) struct Wishes<'a> {
 }
 
 impl Plan {
-    /// Plans the topics and nodes of `graphs` and `nodes` that are not in `known`.
+    /// Plans the values and calls of `models`, and the topics and nodes of `graphs` and `nodes`,
+    /// that are not in `known`.
     pub(super) fn new(
+        models: &[Model],
         graphs: &[Graph],
         nodes: &[Nodes],
         wishes: &Wishes<'_>,
@@ -82,14 +87,17 @@ impl Plan {
             registries: [registry(false), registry(true)],
             ua: Vec::new(),
             alike: HashMap::new(),
+            modelled: HashSet::new(),
+            of_models: HashMap::new(),
             known,
         };
         planner.spaces(graphs);
+        planner.models(models, wishes.namespace);
         let servers = planner.servers(nodes);
         planner.nodes(nodes, &servers, wishes.namespace);
         planner.topics(graphs, wishes);
         planner.rest();
-        planner.calls(graphs, (nodes, &servers), wishes.namespace);
+        planner.calls(models, graphs, (nodes, &servers), wishes.namespace);
         planner.plan
     }
 }
@@ -103,6 +111,10 @@ struct Planner<'k> {
     ua: Vec<Option<UaVariable>>,
     /// Positions of the nodes by name, as [`normal`] returns it.
     alike: HashMap<String, Vec<usize>>,
+    /// The topics that models bind.
+    modelled: HashSet<(SpaceId, String)>,
+    /// Positions of the entries of models by their nodes.
+    of_models: HashMap<NodeIdText, usize>,
     known: &'k mut Known,
 }
 
@@ -159,7 +171,7 @@ impl Planner<'_> {
 
     /// Collects the new nodes, in the namespaces of the mapping.
     fn nodes(&mut self, sources: &[Nodes], servers: &[Option<String>], uri: &str) {
-        let mut indexes = Indexes::of(self.known.mapping.namespaces());
+        let mut indexes = self.indexes();
         let mut taken = BTreeSet::new();
         let (mut ua, mut twins) = (Vec::new(), Vec::new());
         for (source, server) in sources.iter().zip(servers) {
@@ -178,6 +190,14 @@ impl Planner<'_> {
                 }
                 let from = server.as_deref();
                 let from = from.map(|server| source_of(server, &one.node, &source.namespaces));
+                if let Some(at) = self.of_models.get(&node) {
+                    // The server has the node of the model.
+                    if let Some(entry) = self.plan.entries.get_mut(*at) {
+                        entry.source = entry.source.take().or(from);
+                        entry.value = entry.value.or(one.value);
+                    }
+                    continue;
+                }
                 let known = match &from {
                     Some(from) if self.known.has_source(from) => continue,
                     // Two servers of the same model have nodes of the same names.
@@ -267,6 +287,9 @@ impl Planner<'_> {
                 self.leave_out(space, why, name);
                 continue;
             }
+            if self.modelled.contains(&(space, name.to_owned())) {
+                continue;
+            }
             let Some(kind) = kind else {
                 if self.known.is_set_aside(name) {
                     continue;
@@ -309,7 +332,7 @@ impl Planner<'_> {
             bindings,
         } = candidate;
         let value = match bindings.first().map(|one| &one.form) {
-            Some(Form::Field(_, value)) => Some(*value),
+            Some(Form::Field(_, value)) => *value,
             Some(Form::Whole | Form::Bytes) | None => None,
         };
         let mut notes = Vec::new();
@@ -372,6 +395,13 @@ impl Planner<'_> {
             faulty: None,
             is_set_aside: self.known.is_set_aside(&topic),
         });
+    }
+
+    /// Returns the namespace indexes of the mapping and of the plan.
+    fn indexes(&self) -> Indexes {
+        let mut all = self.known.mapping.namespaces().clone();
+        all.extend(self.plan.namespaces.clone());
+        Indexes::of(&all)
     }
 
     /// Returns the namespace of values without a node; `None` if no index is free.
@@ -439,8 +469,24 @@ impl Planner<'_> {
         self.plan.entries.push(entry);
     }
 
-    fn calls(&mut self, graphs: &[Graph], nodes: (&[Nodes], &[Option<String>]), uri: &str) {
-        let (found, untyped) = calls::candidates(graphs, nodes, self.known);
+    fn calls(
+        &mut self,
+        models: &[Model],
+        graphs: &[Graph],
+        nodes: (&[Nodes], &[Option<String>]),
+        uri: &str,
+    ) {
+        let mut found = calls::modelled(models, self.known);
+        let (others, untyped) = calls::candidates(graphs, nodes, self.known);
+        for other in others {
+            if !found.iter().any(|one| one.is_same(&other)) {
+                found.push(other);
+            }
+        }
+        if !models.is_empty() {
+            // Calls of one space have one heading.
+            found.sort_by_key(|one| (one.origin == SpaceId::UA, one.origin));
+        }
         self.plan.untyped = untyped;
         for one in found {
             let Some(namespace) = self.namespace(uri) else {

@@ -30,14 +30,14 @@ fn graph(space: u16, topics: &[(&str, &str, bool)]) -> Graph {
 }
 
 fn fresh(graphs: &[Graph]) -> String {
-    let mut plan = Plan::new(graphs, &[], &WISHES, &mut Known::default());
+    let mut plan = Plan::new(&[], graphs, &[], &WISHES, &mut Known::default());
     written("", &[], &mut plan).unwrap()
 }
 
 fn merged(text: &str, graphs: &[Graph]) -> String {
     let mapping = mapping(text);
     let mut known = Known::of(mapping.clone(), text);
-    let mut plan = Plan::new(graphs, &[], &WISHES, &mut known);
+    let mut plan = Plan::new(&[], graphs, &[], &WISHES, &mut known);
     added("", (text, &mapping), &mut plan).unwrap()
 }
 
@@ -255,7 +255,7 @@ fn what_is_executed_anywhere_becomes_calls_once() {
     };
     let graphs = [ros1, ros2];
     let servers = ["opc.tcp://127.0.0.1:4840", "opc.tcp://plc:4840"].map(server);
-    let mut plan = Plan::new(&graphs, &servers, &WISHES, &mut Known::default());
+    let mut plan = Plan::new(&[], &graphs, &servers, &WISHES, &mut Known::default());
     let text = written("", &[], &mut plan).unwrap();
     let found = mapping(&text);
     let calls: Vec<(String, &str)> = found
@@ -289,7 +289,7 @@ fn what_is_executed_anywhere_becomes_calls_once() {
     let sum = Sum::of("x", &plan, true).counts();
     assert!(sum.contains("5 calls, 1 other as comments"), "{sum}");
     let mut known = Known::of(found.clone(), &text);
-    let mut plan = Plan::new(&graphs, &servers, &WISHES, &mut known);
+    let mut plan = Plan::new(&[], &graphs, &servers, &WISHES, &mut known);
     assert_eq!(added("", (&text, &found), &mut plan).unwrap(), text);
 }
 
@@ -354,7 +354,7 @@ fn plc(url: &str, is_cell: bool) -> Nodes {
 }
 
 fn of_servers(servers: &[Nodes], graphs: &[Graph], known: &mut Known) -> Plan {
-    Plan::new(graphs, servers, &WISHES, known)
+    Plan::new(&[], graphs, servers, &WISHES, known)
 }
 
 #[test]
@@ -457,7 +457,7 @@ fn a_command_of_motion_is_proposed_with_what_ends_it() {
             ("/speed", "geometry_msgs/Twist", true),
         ],
     );
-    let mut plan = Plan::new(&[robot], &[], &WISHES, &mut Known::default());
+    let mut plan = Plan::new(&[], &[robot], &[], &WISHES, &mut Known::default());
     let text = written("", &[], &mut plan).unwrap();
     assert_eq!(text.matches("  on_loss: zero\n").count(), 1, "{text}");
     let of_arm = text.split("name: Arm").nth(1).unwrap();
@@ -465,4 +465,71 @@ fn a_command_of_motion_is_proposed_with_what_ends_it() {
     let checked = Mapping::from_yaml(&text, "cell.yaml");
     let codes: Vec<_> = checked.findings.iter().map(|found| found.code).collect();
     assert_eq!(codes, [Code::EndlessMotion], "{}", checked.render(&text));
+}
+
+fn of_model(text: &str, model: &Model, graphs: &[Graph]) -> String {
+    let models = std::slice::from_ref(model);
+    if text.is_empty() {
+        let mut plan = Plan::new(models, graphs, &[], &WISHES, &mut Known::default());
+        return written("", &[], &mut plan).unwrap();
+    }
+    let mapping = mapping(text);
+    let mut known = Known::of(mapping.clone(), text);
+    let mut plan = Plan::new(models, graphs, &[], &WISHES, &mut known);
+    added("", (text, &mapping), &mut plan).unwrap()
+}
+
+#[test]
+fn a_model_becomes_a_mapping_that_runs_and_is_merged_once() {
+    let file = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../tests/data/sysml/line.uml"
+    );
+    let model = survey::model::survey(file).unwrap();
+    // The topic of the model is live too, with another topic.
+    let live = [graph(
+        1,
+        &[
+            ("/conveyor/running", "std_msgs/Bool", true),
+            ("/other", "std_msgs/Bool", true),
+        ],
+    )];
+    let text = of_model("", &model, &live);
+    let mut all = origins(&text);
+    all.sort();
+    let expected = [
+        ("Conveyor.running", "ua_1_2_10", 2),
+        ("Other", "ua_1_3_3", 1),
+        ("Storage.covers", "ua_0_2_12", 0),
+        ("Storage.heights", "ua_0_2_13", 0),
+        ("TurtleBot.speed", "ua_2_3_1", 1),
+        ("TurtleBot.velocity", "ua_0_3_2", 1),
+    ];
+    let expected = expected.map(|(name, topic, count)| (name.to_owned(), topic.to_owned(), count));
+    assert_eq!(all, expected, "{text}");
+    let mapping = mapping(&text);
+    assert_eq!(mapping.calls().len(), 1, "{text}");
+    let domain = mapping.domain_of(SpaceId::new(2).unwrap());
+    assert_eq!(domain, Some(7), "{text}");
+    assert!(text.contains("field: twist.twist.linear.x"), "{text}");
+    assert!(text.contains("on_loss: zero"), "{text}");
+    assert!(!text.contains("guess:"), "{text}");
+    assert_eq!(of_model(&text, &model, &live), text);
+}
+
+#[test]
+fn a_topic_of_a_model_that_the_mapping_lacks_is_proposed_and_not_bound() {
+    let text = "spaces:\n  - {id: 1}\nnamespaces:\n  2: urn:example:line\nvariables:\n  - {node: ns=2;i=10, name: running, \
+                origin: 1, ros: {topic: /conveyor/running, type: std_msgs/Bool}}\n";
+    let file = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../tests/data/sysml/line.uml"
+    );
+    let model = survey::model::survey(file).unwrap();
+    let more = of_model(text, &model, &[]);
+    assert!(
+        more.contains("/line/conveyor_running is a topic of Conveyor.running in the model"),
+        "{more}"
+    );
+    assert_eq!(origins(&more).len(), 5, "{more}");
 }

@@ -79,8 +79,8 @@ fn is_of_action(topic: &str, kind: &str) -> bool {
 /// The part of a message that is the value.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Form {
-    /// The path of the only field, and its type.
-    Field(String, (BuiltinType, bool)),
+    /// The path of the only field, and its type; `None` if the type is unknown here.
+    Field(String, Option<(BuiltinType, bool)>),
     /// All fields.
     Whole,
     /// The serialized message.
@@ -96,7 +96,7 @@ impl Form {
         let known = registry.get(kind);
         match known.as_ref().map(|known| known.leaves()) {
             Ok([one]) if one.builtin != BuiltinType::ExtensionObject => {
-                Self::Field(one.path.clone(), value_type(one))
+                Self::Field(one.path.clone(), Some(value_type(one)))
             }
             Ok(_) | Err(_) => Self::Whole,
         }

@@ -1,0 +1,398 @@
+//! Reads a UML model with stereotypes from XMI, as Papyrus writes it into `.uml` files (XMI 2.5.1).
+//!
+//! Stereotypes are elements beside the model, such as `<UaBridge:Ros1Topic base_Property="_id"/>`.
+//! Their values are attributes or child elements. A value that equals its default is not written.
+
+use std::collections::HashMap;
+
+use quick_xml::XmlVersion;
+use quick_xml::events::{BytesStart, Event};
+use quick_xml::reader::Reader;
+
+use super::{Applied, DEEPEST, Element, ElementKind, Finding, MOST_ELEMENTS, Tag, shown};
+
+/// Returns the elements with stereotypes, and the findings.
+///
+/// # Errors
+/// The fault that makes the rest of the file unreadable.
+pub(super) fn elements(xml: &str) -> Result<(Vec<Element>, Vec<Finding>), Finding> {
+    if xml_text::has_more_attributes(xml, MOST_ATTRIBUTES) {
+        return Err(Finding::new(
+            1,
+            format!("an element has more than {MOST_ATTRIBUTES} attributes"),
+        ));
+    }
+    let mut reader = Reader::from_str(xml);
+    reader.config_mut().expand_empty_elements = true;
+    reader.config_mut().trim_text(true);
+    let mut document = Document::default();
+    let mut lines = Lines::default();
+    loop {
+        let at = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
+        let line = lines.at(xml, at);
+        let fault = |what: String| Finding::new(line, what);
+        let event = reader.read_event();
+        match event.map_err(|error| fault(format!("this is not XML: {error}")))? {
+            Event::Start(element) => document.open(&element, line).map_err(fault)?,
+            Event::End(_) => document.close(),
+            Event::Text(text) => document.text.push_str(&text.xml10_content()),
+            Event::CData(text) => document.text.push_str(&text.xml10_content()),
+            Event::GeneralRef(entity) => {
+                let found = entity.resolve_char_ref().ok().flatten();
+                let known = quick_xml::escape::resolve_predefined_entity(&entity.xml10_content());
+                match (found, known) {
+                    (Some(char), _) => document.text.push(char),
+                    (None, Some(text)) => document.text.push_str(text),
+                    (None, None) => return Err(fault("an entity that XML does not have".into())),
+                }
+            }
+            Event::DocType(_) => {
+                return Err(fault(
+                    "a model has no document type; remove the `<!DOCTYPE ..>`".to_owned(),
+                ));
+            }
+            Event::Eof if !document.path.is_empty() => {
+                return Err(fault("the file ends in the middle".to_owned()));
+            }
+            Event::Eof => break,
+            // An empty element is reported as its start and its end.
+            Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
+        }
+    }
+    if document.nodes.is_empty() {
+        return Err(Finding::new(1, "there is no `uml:Model` in the file"));
+    }
+    Ok(document.elements())
+}
+
+/// Counts the lines up to ascending offsets.
+#[derive(Default)]
+struct Lines {
+    at: usize,
+    before: usize,
+}
+
+impl Lines {
+    /// Returns the line, from 1, of the first character at or after `at` that is not a space.
+    fn at(&mut self, text: &str, at: usize) -> usize {
+        let rest = text.get(at..).unwrap_or_default();
+        let at = at + (rest.len() - rest.trim_start().len());
+        let passed = text.get(self.at..at).unwrap_or_default();
+        self.before += passed.matches('\n').count();
+        self.at = at.max(self.at);
+        self.before + 1
+    }
+}
+
+#[derive(Default)]
+struct Document {
+    path: Vec<Open>,
+    text: String,
+    nodes: Vec<Node>,
+    ids: HashMap<String, usize>,
+    applications: Vec<Application>,
+}
+
+/// An open XML element.
+enum Open {
+    /// The element around the model and its stereotypes.
+    Xmi,
+    Node(usize),
+    Application(usize),
+    /// A value of a stereotype: the application, the name and the line.
+    Tag(usize, String, usize),
+    Other,
+}
+
+/// An element of the model.
+#[derive(Default)]
+struct Node {
+    /// The name of the XML element.
+    tag: String,
+    /// The UML class, such as `Property`.
+    class: String,
+    name: String,
+    parent: Option<usize>,
+    line: usize,
+    /// The id of the type.
+    type_id: Option<String>,
+    /// The name of a type in another file.
+    type_name: Option<String>,
+    is_array: bool,
+}
+
+#[derive(Default)]
+struct Application {
+    applied: Applied,
+    /// The ids of the element, by its UML classes.
+    bases: Vec<String>,
+    /// The address of an element in another file.
+    elsewhere: Option<String>,
+}
+
+impl Document {
+    fn open(&mut self, element: &BytesStart<'_>, line: usize) -> Result<(), String> {
+        let local = element.local_name().into_inner().to_owned();
+        let is_uml = element.name().into_inner().starts_with("uml:");
+        self.text.clear();
+        let mut attributes = Vec::new();
+        for attribute in element.attributes() {
+            let attribute = attribute.map_err(|error| format!("in <{local}>: {error}"))?;
+            let value = attribute
+                .normalized_value(XmlVersion::Implicit1_0)
+                .map_err(|error| format!("in <{local}>: {error}"))?;
+            attributes.push((attribute.key.into_inner().to_owned(), value.into_owned()));
+        }
+        if self.path.len() >= DEEPEST {
+            return Err(format!("elements are nested deeper than {DEEPEST}"));
+        }
+        let open = match self.path.last() {
+            None if local == "XMI" => Open::Xmi,
+            None | Some(Open::Xmi) if is_uml => self.node(local, attributes, line)?,
+            None => {
+                return Err(format!(
+                    "this is a <{}>, no model; Papyrus keeps the model in the file that ends in \
+                     `.uml`",
+                    shown(&local)
+                ));
+            }
+            Some(Open::Xmi) => self.application(local, attributes, line)?,
+            Some(Open::Application(at)) => self.tag(*at, local, &attributes, line),
+            Some(Open::Node(_) | Open::Other) => self.inside(local, attributes, line)?,
+            Some(Open::Tag(..)) => Open::Other,
+        };
+        self.path.push(open);
+        Ok(())
+    }
+
+    fn close(&mut self) {
+        let text = self.text.trim().to_owned();
+        self.text.clear();
+        if let Some(Open::Tag(at, name, line)) = self.path.pop()
+            && let Some(application) = self.applications.get_mut(at)
+        {
+            let value = text;
+            application.applied.tags.push(Tag { name, value, line });
+        }
+    }
+
+    /// Returns the nearest element of the model around the open XML element.
+    fn owner(&self) -> Option<usize> {
+        self.path.iter().rev().find_map(|open| match open {
+            Open::Node(at) => Some(*at),
+            Open::Xmi | Open::Application(_) | Open::Tag(..) | Open::Other => None,
+        })
+    }
+
+    fn inside(
+        &mut self,
+        local: String,
+        attributes: Vec<(String, String)>,
+        line: usize,
+    ) -> Result<Open, String> {
+        let owner = self.owner();
+        let is_direct = matches!(self.path.last(), Some(Open::Node(_)));
+        if let Some(owner) = owner
+            .and_then(|at| self.nodes.get_mut(at))
+            .filter(|_| is_direct)
+        {
+            match local.as_str() {
+                "type" => {
+                    let href = value(&attributes, "href");
+                    owner.type_name = href.and_then(last_word);
+                    if let Some(id) = value(&attributes, "xmi:idref") {
+                        owner.type_id = Some(id.to_owned());
+                    }
+                    return Ok(Open::Other);
+                }
+                "upperValue" => {
+                    let upper = value(&attributes, "value").unwrap_or("0");
+                    owner.is_array = !matches!(upper, "0" | "1");
+                    return Ok(Open::Other);
+                }
+                _ => {}
+            }
+        }
+        match value(&attributes, "xmi:id") {
+            Some(_) if local != "eAnnotations" => self.node(local, attributes, line),
+            Some(_) | None => Ok(Open::Other),
+        }
+    }
+
+    fn node(
+        &mut self,
+        tag: String,
+        attributes: Vec<(String, String)>,
+        line: usize,
+    ) -> Result<Open, String> {
+        if self.nodes.len() >= MOST_ELEMENTS {
+            return Err(format!("more than {MOST_ELEMENTS} elements are not read"));
+        }
+        let at = self.nodes.len();
+        let mut node = Node {
+            class: tag.clone(),
+            tag,
+            parent: self.owner(),
+            line,
+            ..Node::default()
+        };
+        for (key, value) in attributes {
+            match key.as_str() {
+                "xmi:id" => _ = self.ids.insert(value, at),
+                "xmi:type" => {
+                    let class = value.rsplit(':').next().unwrap_or_default();
+                    node.class = class.to_owned();
+                }
+                "name" => node.name = value,
+                "type" => node.type_id = Some(value),
+                _ => {}
+            }
+        }
+        self.nodes.push(node);
+        Ok(Open::Node(at))
+    }
+
+    fn application(
+        &mut self,
+        stereotype: String,
+        attributes: Vec<(String, String)>,
+        line: usize,
+    ) -> Result<Open, String> {
+        if self.applications.len() >= MOST_ELEMENTS {
+            return Err(format!(
+                "more than {MOST_ELEMENTS} stereotypes are not read"
+            ));
+        }
+        let mut application = Application {
+            applied: Applied {
+                stereotype,
+                line,
+                tags: Vec::new(),
+            },
+            ..Application::default()
+        };
+        for (name, value) in attributes {
+            if name.starts_with("base_") {
+                application.bases.push(value);
+            } else if !name.contains(':') && name != "xmlns" {
+                application.applied.tags.push(Tag { name, value, line });
+            }
+        }
+        self.applications.push(application);
+        Ok(Open::Application(self.applications.len().saturating_sub(1)))
+    }
+
+    fn tag(
+        &mut self,
+        at: usize,
+        name: String,
+        attributes: &[(String, String)],
+        line: usize,
+    ) -> Open {
+        if !name.starts_with("base_") {
+            return match value(attributes, "xsi:nil") {
+                Some("true") => Open::Other,
+                Some(_) | None => Open::Tag(at, name, line),
+            };
+        }
+        if let Some(application) = self.applications.get_mut(at) {
+            let base = value(attributes, "xmi:idref").map(str::to_owned);
+            application.bases.extend(base);
+            if let Some(href) = value(attributes, "href") {
+                application.elsewhere = Some(href.to_owned());
+            }
+        }
+        Open::Other
+    }
+
+    /// Returns the elements with stereotypes in the order of the file, and the stereotypes without
+    /// an element.
+    fn elements(mut self) -> (Vec<Element>, Vec<Finding>) {
+        let mut findings = Vec::new();
+        let mut applied: HashMap<usize, Vec<Applied>> = HashMap::new();
+        for application in std::mem::take(&mut self.applications) {
+            let stereotype = application.applied.stereotype.as_str();
+            let mut bases = application.bases.iter();
+            match bases.find_map(|id| self.ids.get(id)) {
+                Some(at) => applied.entry(*at).or_default().push(application.applied),
+                // Metadata of other profiles and tools needs no element.
+                None if !is_ours(stereotype) => {}
+                None => {
+                    let line = application.applied.line;
+                    let what = match (&application.elsewhere, application.bases.first()) {
+                        (Some(href), _) => format!(
+                            "the element of {stereotype} is in another file, `{}`; give that file",
+                            shown(href)
+                        ),
+                        (None, Some(id)) => format!(
+                            "the element `{}` of {stereotype} is not in the model",
+                            shown(id)
+                        ),
+                        (None, None) => format!("{stereotype} has no element"),
+                    };
+                    findings.push(Finding::new(line, what));
+                }
+            }
+        }
+        let mut marked: Vec<(usize, Vec<Applied>)> = applied.into_iter().collect();
+        marked.sort_by_key(|(at, _)| *at);
+        let elements = marked.into_iter();
+        let elements = elements.filter_map(|(at, applied)| self.element(at, applied));
+        (elements.collect(), findings)
+    }
+
+    fn element(&self, at: usize, applied: Vec<Applied>) -> Option<Element> {
+        let node = self.nodes.get(at)?;
+        let mut owners = Vec::new();
+        let mut above = node.parent;
+        // Each parent precedes its children, so the chain ends.
+        while let Some(owner) = above.and_then(|at| self.nodes.get(at)) {
+            let is_package = ["Model", "Package", "Profile"].contains(&owner.class.as_str());
+            if !owner.name.is_empty() && !is_package {
+                owners.push(owner.name.clone());
+            }
+            above = owner.parent;
+        }
+        owners.reverse();
+        let of_id = node.type_id.as_ref().and_then(|id| self.ids.get(id));
+        let of_id = of_id.and_then(|at| self.nodes.get(*at));
+        let kind = match node.class.as_str() {
+            "Property" | "Port" | "ExtensionEnd" => ElementKind::Property,
+            "Operation" | "Reception" | "Activity" => ElementKind::Operation,
+            _ if node.tag == "ownedAttribute" => ElementKind::Property,
+            _ if node.tag == "ownedOperation" => ElementKind::Operation,
+            _ => ElementKind::Other,
+        };
+        Some(Element {
+            owners,
+            name: node.name.clone(),
+            kind,
+            type_name: of_id
+                .map(|node| node.name.clone())
+                .or_else(|| node.type_name.clone()),
+            is_array: node.is_array,
+            line: node.line,
+            applied,
+        })
+    }
+}
+
+fn value<'a>(attributes: &'a [(String, String)], key: &str) -> Option<&'a str> {
+    let found = attributes.iter().find(|(name, _)| name == key);
+    found.map(|(_, value)| value.as_str())
+}
+
+/// Returns the name of a type in a library: `..UMLPrimitiveTypes.library.uml#Boolean` is
+/// `Boolean`.
+fn last_word(href: &str) -> Option<String> {
+    let (_, fragment) = href.rsplit_once('#')?;
+    let word = fragment.rsplit(['_', '.', '/', '-']).next()?;
+    (!word.is_empty()).then(|| word.to_owned())
+}
+
+fn is_ours(stereotype: &str) -> bool {
+    stereotype.starts_with("Ros1") || stereotype.starts_with("Ros2") || stereotype.starts_with("Ua")
+}
+
+/// Maximum number of attributes of an XML element.
+const MOST_ATTRIBUTES: usize = 1000;
