@@ -99,7 +99,7 @@ def views(judge, url, topic):
     for scheme in ["light", "dark"]:
         for size in [WIDE, PHONE]:
             judge.look(scheme, size)
-            for view in ["programs", "values", f"topic/{topic}", "map", "skills", "processes", "alarms"]:
+            for view in ["programs", "values", f"topic/{topic}", "map", "skills", "processes", "events", "alarms"]:
                 judge.open(url, view)
                 judge.wait(f"{view} is live", lambda: judge.text("#link") == "live")
                 judge.wait(f"{view} has a title", lambda: judge.text("h1"))
@@ -131,6 +131,50 @@ def values(judge, url):
     topic = judge.driver.current_url.rsplit("/", 1)[-1]
     judge.driver.back()
     return topic
+
+
+def events(judge, url):
+    """Waits for strips and rows, holds the view by the keyboard, and changes the period."""
+    judge.look("light", WIDE)
+    judge.open(url, "events")
+    rows = lambda: [one.get_attribute("data-id") for one in judge.driver.find_elements(By.CSS_SELECTOR, "tbody tr[data-id]")]
+    judge.wait("there are events", rows)
+    judge.wait("there is a strip", lambda: judge.driver.find_elements(By.CSS_SELECTOR, ".gantt .event-bar"))
+    first = rows()[0]
+    judge.wait("events are added", lambda: rows()[0] != first)
+    hold = judge.driver.find_element(By.CSS_SELECTOR, "main input[type=checkbox]")
+    hold.send_keys(Keys.SPACE)
+    if not hold.is_selected():
+        judge.faults.append("events: the keyboard does not hold the view")
+    hold.send_keys(Keys.SPACE)
+    judge.driver.find_element(By.CSS_SELECTOR, "main select").send_keys("All")
+    judge.wait("all events are drawn", lambda: judge.driver.find_elements(By.CSS_SELECTOR, ".gantt .event-bar"))
+
+
+def recorded(judge, binaries, file):
+    """Shows a recording of the demo on a page of its own."""
+    address = "127.0.0.1:9153"
+    page = subprocess.Popen([binaries / "ua-space", "page", "--interface", "lo", "--metrics", address, "--recording", file],
+                            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        url = f"http://{address}/"
+        judge.wait("the page is served", lambda: served(judge, url))
+        for scheme in ["light", "dark"]:
+            for size in [WIDE, PHONE]:
+                judge.look(scheme, size)
+                judge.open(url, "events")
+                judge.wait("the recording is named", lambda: file.name in judge.text(".summary"))
+                judge.wait("there is a strip", lambda: judge.driver.find_elements(By.CSS_SELECTOR, ".gantt .event-bar"))
+                judge.driver.find_element(By.CSS_SELECTOR, "main select").send_keys("All")
+                name = f"recording-{scheme}-{'phone' if size == PHONE else 'wide'}"
+                judge.shoot(name)
+                judge.overflow(name)
+                judge.accessible(name)
+        judge.console()
+        judge.driver.get("about:blank")
+    finally:
+        page.send_signal(signal.SIGTERM)
+        page.wait(20)
 
 
 def add_user(binaries, pki, name, role):
@@ -295,14 +339,26 @@ def main():
             judge.out = arguments.out / scenario
             judge.out.mkdir(exist_ok=True)
             judge.wait("the page is served", lambda: served(judge, url))
+            recording = arguments.out / f"{scenario}.pcapng"
+            recording.unlink(missing_ok=True)
+            recorder = subprocess.Popen([arguments.binaries / "ua-space", "record", recording, "--interface", "lo"],
+                                        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             views(judge, url, values(judge, url))
             if scenario == "line-by-topics":
+                events(judge, url)
                 switch_off(judge, arguments.binaries, url, folder)
+                judge.open(url, "events")
+                judge.wait("the call is an event", lambda: "requested" in judge.text())
+                judge.shoot("events-switched-off-light-wide")
             judge.console()
             judge.driver.get("about:blank")
+            recorder.send_signal(signal.SIGINT)
+            recorder.wait(20)
         finally:
             demo.send_signal(signal.SIGINT)
             demo.communicate(timeout=60)
+        if scenario == "line-by-topics":
+            recorded(judge, arguments.binaries, recording)
     judge.out = arguments.out
     with tempfile.TemporaryDirectory() as folder:
         operate(judge, arguments.binaries, pathlib.Path(folder), arguments.examples)

@@ -9,7 +9,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use system_tests::{
     Browser, Cell, Child, METRICS_SERVER, Peer, SERVER_ENDPOINT, Started, UadpSocket, eventually,
-    http_get, program, resident,
+    holds_for, http_get, program, resident,
 };
 use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
 
@@ -19,6 +19,10 @@ const PASSWORD: &str = "correct horse battery";
 
 /// Returns a datagram with one Double of a ROS 1 topic.
 fn datagram(id: u16, value: f64) -> Vec<u8> {
+    datagram_of(id, Scalar::Double(value))
+}
+
+fn datagram_of(id: u16, value: Scalar<'_>) -> Vec<u8> {
     let network = NetworkHeader {
         publisher_id: Some(PublisherId::UInt16(1)),
         group: Some(GroupHeader {
@@ -30,7 +34,7 @@ fn datagram(id: u16, value: f64) -> Vec<u8> {
     let mut datagram = Vec::new();
     let mut message = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[id])).unwrap();
     let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
-    frame.scalar(Scalar::Double(value)).unwrap();
+    frame.scalar(value).unwrap();
     frame.finish().unwrap();
     message.finish().unwrap();
     datagram
@@ -96,6 +100,65 @@ fn a_browser_receives_the_visible_values_without_a_server() {
         (gone["state"] == "down" && own["state"] == "ready").then_some(())
     });
     drop(page);
+}
+
+#[test]
+fn events_are_shown_live_and_from_a_recording() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let file = cell.folder().join("events.pcapng");
+    let name = file.to_str().unwrap();
+    let mut page = page_of_space(&cell, &[]);
+    let group = UadpSocket::join();
+    let mut recording = Started::new("ua-space", &program("ua-space"))
+        .args(["record", name, "--count", "4", "--interface", "lo"])
+        .start();
+    let mut value = false;
+    eventually("four changes are recorded", SOON, || {
+        value = !value;
+        group.send(&datagram_of(10, Scalar::Boolean(value)));
+        (!recording.runs()).then_some(())
+    });
+    let texts = |view: &Value| {
+        let events = view["events"].as_array().cloned().unwrap_or_default();
+        let texts = events
+            .iter()
+            .map(|one| one["text"].as_str().map(str::to_owned));
+        texts.flatten().collect::<Vec<_>>()
+    };
+    let mut live = Browser::of(PAGE).events("view=events");
+    live.until("the changes are events", |view| {
+        let is_live = view["recording"].is_null() && view["names"]["ua_1_2_10"][0] == "ROS 1";
+        let texts = texts(view);
+        let has_both = ["true", "false"]
+            .iter()
+            .all(|text| texts.iter().any(|one| one == text));
+        (is_live && has_both).then_some(())
+    });
+    page.end();
+
+    let _page = page_of_space(&cell, &["--recording", name]);
+    let mut shown = Vec::new();
+    let mut recorded = Browser::of(PAGE).events("view=events");
+    recorded.until("the events of the recording are shown", |view| {
+        shown.extend(texts(view));
+        (view["recording"] == "events.pcapng" && shown.len() >= 4).then_some(())
+    });
+    assert_eq!(shown.len(), 4, "{shown:?}");
+    // The group is not shown.
+    let mut values = Browser::of(PAGE).events("view=values&count=10");
+    let total = |view: &Value| view["total"].as_u64();
+    assert_eq!(values.until("the values are there", total), 1);
+    holds_for(
+        "only the topic of the recording is shown",
+        Duration::from_secs(1),
+        || {
+            group.send(&datagram(11, 1.0));
+            let mut values = Browser::of(PAGE).events("view=values&count=10");
+            values.until("the values are there", total) == 1
+        },
+    );
 }
 
 #[test]

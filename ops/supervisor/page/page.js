@@ -8,9 +8,10 @@ import * as topic from "/topic.js";
 import * as map from "/map.js";
 import * as skills from "/skills.js";
 import * as processes from "/processes.js";
+import * as events from "/events.js";
 import * as alarms from "/alarms.js";
 
-const VIEWS = { programs, values, topic, map, skills, processes, alarms };
+const VIEWS = { programs, values, topic, map, skills, processes, events, alarms };
 const QUIET_MS = 12000;
 
 const main = document.getElementById("main");

@@ -2,7 +2,7 @@
 
 import { badge, clock, empty, h, render, s, several } from "/dom.js";
 
-const SEVERITY = { running: "run", done: "good", failed: "bad", lost: "bad", stopped: "uncertain" };
+const SEVERITY = { running: "run", done: "good", failed: "bad", lost: "bad", stopped: "uncertain", unknown: "uncertain" };
 
 export function show(root) {
   const summary = h("p", { class: "summary", role: "status" });

@@ -23,9 +23,11 @@ pub(crate) struct Description {
     pub(crate) from: Option<SocketAddr>,
 }
 
-/// Reads a datagram. Returns `None` unless it is the announcement of a value.
-pub(crate) fn read(datagram: &[u8], from: SocketAddr) -> Option<(TopicId, Description)> {
-    let message = NetworkMessage::decode(datagram).ok()?;
+/// Reads a message. Returns `None` unless it is the announcement of a value.
+pub(crate) fn read(
+    message: &NetworkMessage<'_>,
+    from: SocketAddr,
+) -> Option<(TopicId, Description)> {
     if message.message_type() != NetworkMessageType::Announcement
         || message.is_sealed()
         || message.is_chunk()
@@ -35,7 +37,7 @@ pub(crate) fn read(datagram: &[u8], from: SocketAddr) -> Option<(TopicId, Descri
     let Some(PublisherId::UInt16(space)) = message.publisher_id() else {
         return None;
     };
-    let announcement = Announcement::decode(&message).ok()?;
+    let announcement = Announcement::decode(message).ok()?;
     let Announced::DataSetMetaData {
         writer_id,
         meta_data,

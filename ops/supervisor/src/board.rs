@@ -15,6 +15,7 @@ use uadp::Timestamp;
 use crate::announced::Description;
 use crate::operations::ConditionState;
 use crate::program::Program;
+use crate::timeline::{Call, Timeline};
 use crate::value;
 
 /// The time of an event on both clocks.
@@ -45,6 +46,8 @@ pub(crate) struct Board {
     /// The calls that can be requested, and whether this program executes them itself.
     pub(crate) calls: BTreeMap<TopicId, (Arc<CallDescription>, bool)>,
     pub(crate) programs: Vec<Program>,
+    /// The events of values and calls.
+    pub(crate) timeline: Timeline,
     /// The conditions of the program, if it has any; read while a browser shows them.
     pub(crate) conditions: Option<Vec<ConditionState>>,
     /// The number of values of topics for which there was no room.
@@ -146,7 +149,14 @@ impl Board {
             self.left_out += 1;
             return;
         };
+        let has_changed = entry.count == 0 || entry.block != *block || entry.status != status;
         let delay = entry.update(sample, at);
+        let Self {
+            topics, timeline, ..
+        } = self;
+        if has_changed && let Some(entry) = topics.get(&topic) {
+            timeline.value(topic, entry, at);
+        }
         if let Some(watched) = self.watched.get_mut(&topic) {
             if watched.samples.len() >= MOST_SAMPLES {
                 watched.samples.pop_front();
@@ -191,6 +201,22 @@ impl Board {
             entry.is_silent = is_silent;
             entry.version += 1;
         }
+    }
+
+    /// Takes a request or response that was received in clear.
+    pub(crate) fn called(&mut self, call: Call, at: At) {
+        self.timeline.call(call, at);
+    }
+
+    /// Returns the participant, the name and the world of each topic with events.
+    pub(crate) fn event_names(&self) -> serde_json::Value {
+        self.timeline.names(|topic| match self.calls.get(&topic) {
+            Some((call, _)) => call.name.clone(),
+            None => {
+                let entry = self.topics.get(&topic);
+                entry.map_or_else(|| topic.to_string(), |entry| entry.name(topic))
+            }
+        })
     }
 
     /// Takes a call; `is_own` if this program executes it.

@@ -5,7 +5,7 @@
 //! that status, without files: HTML, styles and scripts are part of the program.
 //!
 //! Reading order: `board` (the last value of each topic), `announced` (names and units),
-//! `program` (rows of programs), `skill` (tiles of skills), `view` (what a browser is sent),
+//! `program` (rows of programs), `skill` (tiles of skills), `timeline` (events), `view` (what a browser is sent),
 //! `stream` (server-sent events), `fetch` (the status of other programs), `page` (state and
 //! events), `session` (signed-in users), `encode` (forms), `operations` (commands), `proxy`,
 //! `responses` and `site` (requests).
@@ -23,6 +23,7 @@ mod session;
 mod site;
 mod skill;
 mod stream;
+mod timeline;
 mod value;
 mod view;
 
@@ -30,5 +31,5 @@ pub use fetch::{StatusUrl, StatusUrlError};
 pub use operations::{
     ConditionAction, ConditionChange, ConditionState, MOST_CONDITIONS, OperationFault, Operations,
 };
-pub use page::Page;
+pub use page::{Page, Recorded};
 pub use proxy::{ProxyUrl, ProxyUrlError};

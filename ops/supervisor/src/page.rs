@@ -1,17 +1,18 @@
 //! The state of the page, and the events of the run loop.
 
 use std::net::SocketAddr;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
 use bridge_node::{CallDescription, Delivery, Observer, PortEvent, Statuses, now};
+use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use serde_json::Value;
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::warn;
 use uadp::discovery::{List, Probe};
-use uadp::{PublisherId, SecurityHeader};
+use uadp::{NetworkMessage, PublisherId, SecurityHeader, Timestamp};
 
 use crate::announced::{self, Description};
 use crate::board::{At, Board, Sample};
@@ -21,6 +22,7 @@ use crate::program::Program;
 use crate::proxy::ProxyUrl;
 use crate::session::Sessions;
 use crate::stream::Worker;
+use crate::timeline;
 use crate::view::Viewer;
 
 /// The page of a program.
@@ -33,6 +35,8 @@ pub struct Page {
     pub(crate) operations: OnceLock<Arc<dyn Operations>>,
     pub(crate) sessions: Mutex<Sessions>,
     board: Mutex<Board>,
+    /// Whether the page shows a recording instead of the group.
+    shows_recording: AtomicBool,
     started: Instant,
     /// The locations of the status of other programs.
     others: Vec<StatusUrl>,
@@ -66,12 +70,52 @@ impl Page {
             operations: OnceLock::new(),
             sessions: Mutex::default(),
             board: Mutex::default(),
+            shows_recording: AtomicBool::new(false),
             started: now().monotonic,
             others,
             viewers: AtomicUsize::new(0),
             statuses: OnceLock::new(),
             worker: OnceLock::new(),
         })
+    }
+
+    /// Shows the recording with this name instead of the group.
+    pub fn show_recording(&self, name: &str) {
+        self.shows_recording.store(true, Ordering::Relaxed);
+        self.board().timeline.set_recording(name);
+    }
+
+    /// Takes a datagram of the recording that was received `since` its first datagram.
+    pub fn recorded_datagram(&self, datagram: &[u8], from: SocketAddr, at: (Duration, Timestamp)) {
+        self.read(datagram, from, recorded_at(at));
+    }
+
+    /// Takes a value of the recording that was received `since` its first datagram.
+    pub fn recorded_value(&self, value: &Recorded<'_>, at: (Duration, Timestamp)) {
+        let sample = Sample {
+            topic: value.topic,
+            block: &Bytes::copy_from_slice(value.block),
+            source: value.source,
+            status: value.status,
+        };
+        self.board().take(sample, recorded_at(at));
+    }
+
+    /// Reads the announcement and the calls of a datagram.
+    fn read(&self, datagram: &[u8], from: SocketAddr, at: At) {
+        let Ok(message) = NetworkMessage::decode(datagram) else {
+            return;
+        };
+        if let Some((topic, description)) = announced::read(&message, from) {
+            self.board().announce(topic, description);
+        }
+        for call in timeline::calls(&message) {
+            self.board().called(call, at);
+        }
+    }
+
+    fn is_live(&self) -> bool {
+        !self.shows_recording.load(Ordering::Relaxed)
     }
 
     /// Lets signed-in users operate the cell.
@@ -169,12 +213,15 @@ impl Observer for Page {
     }
 
     fn datagram(&self, datagram: &[u8], from: SocketAddr) {
-        if let Some((topic, description)) = announced::read(datagram, from) {
-            self.board().announce(topic, description);
+        if self.is_live() {
+            self.read(datagram, from, self.at());
         }
     }
 
     fn received(&self, sample: &Delivery) {
+        if !self.is_live() {
+            return;
+        }
         let at = self.at();
         let sample = Sample {
             topic: sample.topic,
@@ -190,6 +237,9 @@ impl Observer for Page {
         reason = "the other events are not shown"
     )]
     fn event(&self, event: &PortEvent) {
+        if !self.is_live() {
+            return;
+        }
         let (topic, block, source, status) = match event {
             PortEvent::Sample {
                 topic,
@@ -237,10 +287,16 @@ impl Observer for Page {
     }
 
     fn silent(&self, topic: TopicId, is_silent: bool) {
+        if !self.is_live() {
+            return;
+        }
         self.board().set_silent(topic, is_silent);
     }
 
     fn call_known(&self, topic: TopicId, description: &Arc<CallDescription>) {
+        if !self.is_live() {
+            return;
+        }
         self.board().offer(topic, description, false);
     }
 
@@ -249,10 +305,30 @@ impl Observer for Page {
     }
 
     fn probe(&self) -> Option<Vec<u8>> {
+        if !self.is_live() {
+            return None;
+        }
         let topics = self.board().nameless();
         let space = topics.first()?.space;
         probe(space, topics.iter().filter(|topic| topic.space == space))
     }
+}
+
+/// A value of a recording.
+#[derive(Debug)]
+pub struct Recorded<'a> {
+    /// The topic of the value.
+    pub topic: TopicId,
+    /// The block of fields.
+    pub block: &'a [u8],
+    /// The time at which the producer's bridge took the value.
+    pub source: Option<Timestamp>,
+    /// The upper half of the StatusCode.
+    pub status: u16,
+}
+
+fn recorded_at((since, utc): (Duration, Timestamp)) -> At {
+    At { since, utc }
 }
 
 /// Returns a probe for the descriptions of topics of a space.

@@ -55,7 +55,7 @@ const HEADERS: [(HeaderName, &str); 6] = [
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
 /// The files of the page by their paths.
-pub(crate) const FILES: [(&str, &str, &str); 13] = [
+pub(crate) const FILES: [(&str, &str, &str); 14] = [
     (
         "/",
         "text/html; charset=utf-8",
@@ -78,6 +78,7 @@ pub(crate) const FILES: [(&str, &str, &str); 13] = [
     ("/values.js", SCRIPT, include_str!("../page/values.js")),
     ("/topic.js", SCRIPT, include_str!("../page/topic.js")),
     ("/alarms.js", SCRIPT, include_str!("../page/alarms.js")),
+    ("/events.js", SCRIPT, include_str!("../page/events.js")),
     ("/map.js", SCRIPT, include_str!("../page/map.js")),
     ("/skills.js", SCRIPT, include_str!("../page/skills.js")),
     (

@@ -28,6 +28,8 @@ pub(crate) enum View {
     Processes,
     /// The conditions of the server.
     Alarms,
+    /// The events of values and calls over time.
+    Events,
 }
 
 /// The visible rows of the list of values.
@@ -51,6 +53,8 @@ pub(crate) struct Viewer {
     total: usize,
     last: String,
     sent_at: Option<Duration>,
+    /// The number of the last event that was sent.
+    event: u64,
 }
 
 impl View {
@@ -87,9 +91,11 @@ impl View {
             "skills" => Self::Skills,
             "processes" => Self::Processes,
             "alarms" => Self::Alarms,
+            "events" => Self::Events,
             other => {
                 return Err(format!(
-                    "view={other}: there are programs, values, topic, map, skills, processes and alarms"
+                    "view={other}: there are programs, values, topic, map, skills, processes, \
+                     alarms and events"
                 ));
             }
         })
@@ -99,7 +105,7 @@ impl View {
     pub(crate) const fn period(&self) -> Duration {
         match self {
             Self::Programs | Self::Map | Self::Processes => Duration::from_secs(1),
-            Self::Values(_) | Self::Topic(_) | Self::Skills | Self::Alarms => {
+            Self::Values(_) | Self::Topic(_) | Self::Skills | Self::Alarms | Self::Events => {
                 Duration::from_millis(250)
             }
         }
@@ -115,6 +121,7 @@ impl Viewer {
             total: 0,
             last: String::new(),
             sent_at: None,
+            event: 0,
         }
     }
 
@@ -141,6 +148,21 @@ impl Viewer {
                 self.changed(shown)
             }
             View::Processes => self.changed(processes(board)),
+            View::Events => {
+                let names = board.event_names();
+                let text = names.to_string();
+                let is_renamed = text != self.last;
+                let is_new = board.timeline.last() > self.event || self.sent_at.is_none();
+                (is_new || is_renamed).then(|| {
+                    let mut shown = board.timeline.after(self.event, now);
+                    if let Some(shown) = shown.as_object_mut().filter(|_| is_renamed) {
+                        shown.insert("names".to_owned(), names);
+                    }
+                    self.event = board.timeline.last();
+                    self.last = text;
+                    shown.to_string()
+                })
+            }
             View::Alarms => self.changed(operations::alarms(board.conditions.as_deref())),
         };
         match data {
@@ -605,6 +627,39 @@ mod tests {
         assert_eq!(viewer.next(&mut board, at(1000).since), None);
         let alive = viewer.next(&mut board, at(6000).since).unwrap();
         assert!(alive.starts_with("event: alive"), "{alive}");
+    }
+
+    #[test]
+    fn each_event_is_sent_once() {
+        let mut board = Board::default();
+        let mut viewer = Viewer::new(View::Events);
+        let first = data(&viewer.next(&mut board, at(0).since).unwrap());
+        assert_eq!(
+            (&first["all"], &first["events"]),
+            (&json!(true), &json!([]))
+        );
+        assert_eq!(viewer.next(&mut board, at(250).since), None);
+        for number in 1..3_u8 {
+            let sample = crate::board::Sample {
+                topic: topic("ua_1_2_1"),
+                block: &vec![1, 0, 3, number].into(),
+                source: None,
+                status: 0,
+            };
+            board.take(sample, at(300));
+            let next = data(&viewer.next(&mut board, at(500).since).unwrap());
+            assert_eq!(next["events"].as_array().unwrap().len(), 1);
+            assert_eq!(next["events"][0]["text"], number.to_string());
+        }
+        assert_eq!(viewer.next(&mut board, at(750).since), None);
+        let named = crate::announced::Description {
+            name: "Storage.Covers".to_owned(),
+            ..crate::announced::Description::default()
+        };
+        board.describe(topic("ua_1_2_1"), named);
+        let renamed = data(&viewer.next(&mut board, at(1000).since).unwrap());
+        assert_eq!(renamed["names"]["ua_1_2_1"][0], "Storage");
+        assert_eq!(renamed["events"], json!([]));
     }
 
     #[test]

@@ -35,6 +35,7 @@ mod packet;
 mod page;
 mod pea;
 mod raw_data;
+mod recorded;
 mod report;
 mod rml;
 mod selector;

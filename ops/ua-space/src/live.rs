@@ -3,7 +3,7 @@
 mod all;
 mod application;
 mod bandwidth;
-mod book;
+pub(crate) mod book;
 mod call;
 mod carrier;
 mod channels;

@@ -1,6 +1,9 @@
 //! `ua-space page`: the page of the cell without a server, read-only.
 
+mod recording;
+
 use std::ffi::OsString;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::{Arc, OnceLock};
 
@@ -20,6 +23,9 @@ pub(crate) struct PageArguments {
     /// Show the program with this address of --metrics, as http://127.0.0.1:9101. May be repeated
     #[arg(long, value_name = "URL")]
     status: Vec<StatusUrl>,
+    /// Show the values, events and calls of this recording (pcapng) instead of the group
+    #[arg(long, value_name = "FILE", conflicts_with = "status")]
+    recording: Option<PathBuf>,
 }
 
 /// The program that serves the page.
@@ -83,6 +89,9 @@ impl Program for Viewer {
     }
 
     async fn start(&self, _context: Context) -> Result<NoSide, Failure> {
+        if let Some(file) = &self.arguments.recording {
+            recording::show(file, self.page())?;
+        }
         Ok(NoSide)
     }
 }

@@ -19,13 +19,14 @@ use uadp::discovery::Probe;
 use uadp::{NetworkMessage, NetworkMessageType};
 
 use self::clock::Clock;
-use self::contents::{Contents, LeftOut, Prepared, Recorded, space};
+use self::contents::{Contents, LeftOut, Prepared, space};
 use super::list::json;
 use super::sealing::Sealing;
 use super::text::{Table, harmless, is_coloured};
 use super::{Go, Incoming, Live, in_group, until};
 use crate::arguments::Replay;
 use crate::exit::Failure;
+use crate::recorded::Recorded;
 use crate::report::warn;
 
 /// Runs `ua-space replay`.
