@@ -484,7 +484,7 @@ impl Planner<'_> {
             }
         }
         if !models.is_empty() {
-            // Calls of one space have one heading.
+            // The calls of a space share a heading.
             found.sort_by_key(|one| (one.origin == SpaceId::UA, one.origin));
         }
         self.plan.untyped = untyped;

@@ -183,7 +183,7 @@ impl Lexer<'_> {
     }
 }
 
-/// Symbols of one character.
+/// Single-character symbols.
 const SYMBOLS: [&str; 26] = [
     "{", "}", "[", "]", "(", ")", ";", ",", ".", "=", "<", ">", "#", "@", "*", "+", "-", "/", "~",
     "!", "?", "|", "&", "^", "%", "$",
