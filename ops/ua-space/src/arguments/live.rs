@@ -246,6 +246,10 @@ pub(crate) struct Trace {
     /// Write a drawing of the delays of each topic: the hops as a waterfall, and their distribution
     #[arg(long, value_name = "FILE")]
     pub(crate) svg: Option<PathBuf>,
+    /// Read the recording (pcapng) of a host instead of listening; one for each host, made at the
+    /// same time. Shows the offsets of their clocks, and the corrected delays between them
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["metrics", "follow", "perfetto", "svg", "otlp"])]
+    pub(crate) recording: Vec<PathBuf>,
     /// Send the counters and delays of programs as metrics of OpenTelemetry (OTLP over HTTP) to
     /// this collector, as http://127.0.0.1:4318, every --seconds (10), until Ctrl-C
     #[arg(long, value_name = "URL", conflicts_with_all = ["follow", "perfetto", "svg", "json"])]

@@ -4,11 +4,13 @@
 //! to this program are computed from the times in its messages: the time at which its writer took
 //! the value, the time of sending, and the time of arrival.
 
+mod clocks;
 mod drawing;
 mod follow;
 mod otlp;
 mod perfetto;
 mod protobuf;
+mod recordings;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs;
@@ -34,6 +36,9 @@ use crate::survey::look;
 pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
     if let Some(target) = &arguments.follow {
         return follow::follow(arguments, target);
+    }
+    if !arguments.recording.is_empty() {
+        return recordings::trace(arguments);
     }
     if let Some(url) = &arguments.otlp {
         return look(otlp::export(arguments, url));
@@ -326,22 +331,6 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
         writeln!(out, "{}", json(&Shown { programs, topics })?)?;
         return Ok(());
     }
-    let figures = |hop: &HopPage| {
-        let negative = match hop.negative {
-            0 => "-".to_owned(),
-            count => count.to_string(),
-        };
-        let [p50, p99, max] = match hop.count {
-            0 => ["-", "-", "-"].map(str::to_owned),
-            _ => [hop.p50_us, hop.p99_us, hop.max_us].map(micros),
-        };
-        [p50, p99, max, hop.count.to_string(), negative]
-    };
-    let head = |first: &[&str], last: &[&str]| {
-        let rest = ["P50", "P99", "MAX", "COUNT", "NEGATIVE"];
-        let names = first.iter().chain(&rest).chain(last);
-        Table::new(names.map(|name| (*name).to_owned()))
-    };
     let bold = is_coloured();
     if !programs.is_empty() {
         let mut table = head(&["PROGRAM", "SPACE", "HOP"], &[]).yielding([2]);
@@ -373,6 +362,26 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
         writeln!(out, "nothing that says its times was heard")?;
     }
     Ok(())
+}
+
+/// Returns the cells of the delays of a hop.
+fn figures(hop: &HopPage) -> [String; 5] {
+    let negative = match hop.negative {
+        0 => "-".to_owned(),
+        count => count.to_string(),
+    };
+    let [p50, p99, max] = match hop.count {
+        0 => ["-", "-", "-"].map(str::to_owned),
+        _ => [hop.p50_us, hop.p99_us, hop.max_us].map(micros),
+    };
+    [p50, p99, max, hop.count.to_string(), negative]
+}
+
+/// Returns a table of delays with columns before and behind the delays.
+fn head(first: &[&str], last: &[&str]) -> Table {
+    let rest = ["P50", "P99", "MAX", "COUNT", "NEGATIVE"];
+    let names = first.iter().chain(&rest).chain(last);
+    Table::new(names.map(|name| (*name).to_owned()))
 }
 
 /// Returns the description of a hop.
