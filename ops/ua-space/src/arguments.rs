@@ -181,7 +181,7 @@ pub(crate) enum Verb {
     /// Exit codes: 0 no errors and warnings, 1 errors or warnings, 64 usage, 74 a file cannot be
     /// written.
     Doctor(Doctor),
-    /// Write a commented starting file: a component, a MES or a mapping
+    /// Write a commented starting file: a component, a MES, a mapping or a model
     ///
     /// Exit codes: 0 done, 64 usage, 74 the file exists or cannot be written.
     New(New),
@@ -225,8 +225,9 @@ pub(crate) enum Verb {
     /// Shows the delays that programs measured (at the address of their --metrics), and those of
     /// each topic on its way to this program, from the timestamps in its messages.
     ///
-    /// Exit codes: 0 done, 64 usage, 69 a program does not answer, or an interface or group is not
-    /// available, 74 the output cannot be written.
+    /// Exit codes: 0 done, 64 usage, 65 recordings that cannot be compared, 69 a program does not
+    /// answer, or an interface or group is not available, 74 a file cannot be read or the output
+    /// cannot be written.
     Trace(Trace),
     /// Record the messages of a running space: all as pcapng, or the values as MCAP
     ///
