@@ -14,10 +14,12 @@ export function show(root) {
   const span = h("select", { "aria-label": "Period" }, WINDOWS.map(([value, text]) => h("option", { value, text })));
   span.value = "120";
   const hold = h("input", { type: "checkbox" });
-  const drawing = h("div", { class: "runs" });
-  const list = h("div", { class: "runs" });
+  // The frames stay, so that a new drawing does not scroll them back.
+  const drawing = frame("Participants", "Events over time");
+  const list = frame("Last events", "The last events");
+  const none = h("div", {});
   root.append(h("div", { class: "head" }, h("h1", { text: "Events" }), summary,
-    h("div", { class: "tools" }, span, h("label", { class: "check" }, hold, "Hold"))), drawing, list);
+    h("div", { class: "tools" }, span, h("label", { class: "check" }, hold, "Hold"))), none, h("div", { class: "runs" }, drawing.card, list.card));
   let events = [];
   let names = {};
   let state = { recording: null, left_out: 0 };
@@ -31,18 +33,19 @@ export function show(root) {
     const source = recording ? `recording ${recording}` : "live";
     const told = `${several(events.length, "event")}, ${source}${left}`;
     render(summary, told, () => [told]);
+    drawing.card.hidden = list.card.hidden = !events.length;
     if (!events.length) {
-      render(drawing, "none", () => [empty("No events", "An event is the change of a Boolean, an integer, a text or the state of a skill, or a call.")]);
-      render(list, "none", () => []);
+      render(none, "none", () => [empty("No events", "An event is the change of a Boolean, an integer, a text or the state of a skill, or a call.")]);
       return;
     }
+    render(none, "", () => []);
     const last = Math.max(...events.slice(-50).map((event) => event.ms));
     const end = held ?? (recording ? last + 1000 : Math.max(now(), last));
     const seconds = span.value === "all" ? Infinity : Number(span.value);
     const begin = seconds === Infinity ? events[0].ms : end - seconds * 1000;
     const key = [events.at(-1).id, Math.floor(end / 500), span.value, state, names];
-    render(drawing, key, () => [strips(events, Math.min(begin, end - 1000), end)]);
-    render(list, [events.at(-1).id, held, names], () => [table(events.filter((event) => event.ms <= end))]);
+    render(drawing.frame, key, () => strips(events, Math.min(begin, end - 1000), end));
+    render(list.frame, [events.at(-1).id, held, names], () => [table(events.filter((event) => event.ms <= end))]);
   };
   hold.addEventListener("change", () => { held = hold.checked ? (state.recording ? null : now()) : null; draw(); });
   span.addEventListener("change", draw);
@@ -66,6 +69,12 @@ export function show(root) {
     },
     tick() { if (!state.recording && events.length) draw(); },
   };
+}
+
+/** Creates a card with a title and a frame that scrolls. */
+function frame(title, label) {
+  const inner = h("div", { class: "table-frame", tabindex: 0, role: "region", "aria-label": label });
+  return { frame: inner, card: h("section", { class: "card", hidden: true }, h("h2", { text: title }), inner) };
 }
 
 /** Groups the events by participant and by value or call. */
@@ -97,7 +106,7 @@ function strips(events, begin, end) {
     rows += fitting.length;
     parts.push(
       s("text", { class: "lane", x: 0, y: y + 16, text: lane.name }),
-      s("text", { class: "tick", x: LEFT, y: y + 16, text: [...lane.worlds].join(", ") }));
+      s("text", { class: "tick", x: LEFT + 5, y: y + 16, text: [...lane.worlds].join(", ") }));
     y += 24;
     for (const row of fitting) {
       parts.push(s("text", { class: "step", x: 0, y: y + 13, text: row.name.length > 28 ? `${row.name.slice(0, 27)}…` : row.name }));
@@ -112,11 +121,10 @@ function strips(events, begin, end) {
   ]);
   const inside = events.filter((event) => event.ms >= begin && event.ms <= end).length;
   const told = `${several(inside, "event")} from ${clock(begin)} to ${clock(end)}; the table has the last of them`;
-  return h("section", { class: "card" },
-    h("h2", { text: "Participants" }),
-    h("div", { class: "table-frame", tabindex: 0, role: "region", "aria-label": "Events over time" },
-      s("svg", { class: "gantt", viewBox: `0 0 1070 ${y}`, role: "img", "aria-label": told }, ticks, parts)),
-    hidden ? h("p", { class: "muted", text: `${several(hidden, "more row")} not drawn` }) : null);
+  return [
+    s("svg", { class: "gantt", viewBox: `0 0 1070 ${y}`, role: "img", "aria-label": told }, ticks, parts),
+    hidden ? h("p", { class: "muted", text: `${several(hidden, "more row")} not drawn` }) : null,
+  ];
 }
 
 /** Draws a bar for each value, from its event to the next. */
@@ -151,12 +159,10 @@ function about(event) {
 
 function table(events) {
   const last = [...events].reverse().slice(0, MOST_LISTED);
-  return h("section", { class: "card" },
-    h("h2", { text: "Last events" }),
-    h("div", { class: "table-frame", tabindex: 0, role: "region", "aria-label": "Last events" }, h("table", { class: "spaces" },
+  return h("table", { class: "spaces" },
       h("thead", {}, h("tr", {}, ["Time", "Participant", "Value or call", "Event", "Arrived after"].map((text, at) => h("th", { scope: "col", class: at > 3 ? "number" : null, text })))),
       h("tbody", {}, last.map((event) => h("tr", { "data-id": event.id },
         h("td", { text: clock(event.ms) }), h("th", { scope: "row", text: event.lane }), h("td", { text: event.row }),
         h("td", { text: event.text }),
-        h("td", { class: "number", text: event.delay_us === null ? "–" : event.delay_us < 0 ? "clocks differ" : delay(event.delay_us) })))))));
+        h("td", { class: "number", text: event.delay_us === null ? "–" : event.delay_us < 0 ? "clocks differ" : delay(event.delay_us) })))));
 }
