@@ -263,10 +263,18 @@ fn add_wrong_and_right(cell: &Cell) {
     assert_eq!(plan["complete"], false, "{plan}");
     let missing = plan["missing"].as_str().unwrap();
     assert!(missing.contains("has no parameter Nonsense"), "{missing}");
+    let (can_run, told) = space(&["plan", "urn:hold"]);
+    assert!(
+        !can_run && told.contains("has no parameter Nonsense"),
+        "{told}"
+    );
 
     let file = cell.file("hold.ttl", &HOLD.replace("FORCE", ""));
     let (added, told) = space(&["source", "add", file.to_str().unwrap()]);
     assert!(added && told.contains("replaced"), "{told}");
+    let (can_run, told) = space(&["plan", "hold"]);
+    let is_chosen = |line: &str| line.contains("parallel-gripper") && line.contains("yes");
+    assert!(can_run && told.lines().any(is_chosen), "{told}");
     let plan = get("/plan/urn:hold").unwrap();
     assert_eq!(plan["complete"], true, "{plan}");
     let chosen: Vec<&Value> = list(&plan["plan"], "steps")

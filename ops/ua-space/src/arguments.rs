@@ -11,8 +11,8 @@ mod write;
 pub(crate) use cell::{Doctor, DriverTemplate, New, StatusArguments, Template};
 pub(crate) use discover::{Discover, Look};
 pub(crate) use live::{
-    Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, Skills, SkillsVerb, Source,
-    SourceAt, SourceVerb, Target, Top, Trace, Types, WatchSkills,
+    Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, PlanArguments, Skills,
+    SkillsVerb, Source, SourceAt, SourceVerb, Target, Top, Trace, Types, WatchSkills,
 };
 pub(crate) use recording::{Record, Replay, Viewers};
 pub(crate) use tap::Tap;
@@ -272,6 +272,14 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, or an unknown question, 65 the query is wrong, 69 no answer in
     /// time, 74 a file cannot be read or the output cannot be written.
     Ask(Ask),
+    /// Show which components would run a process, with the reasons
+    ///
+    /// Lists each skill that the MES considered for each need of the process, and why it was chosen
+    /// or not. Without a process: the processes that the MES knows.
+    ///
+    /// Exit codes: 0 the process can run, 1 a component is missing, 64 usage, or an unknown process,
+    /// 65 the answer was not understood, 69 no answer in time, 74 the output cannot be written.
+    Plan(PlanArguments),
     /// Change the sources of the knowledge of the plant while ua-mes runs
     ///
     /// Adds, replaces and removes NodeSets, manifests of modules, Turtle and processes. Sources

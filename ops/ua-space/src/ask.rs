@@ -133,7 +133,7 @@ async fn questions(server: &Server) -> Result<Questions, Failure> {
     parsed(&answer.body)
 }
 
-fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Failure> {
+pub(crate) fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Failure> {
     serde_json::from_str(body)
         .map_err(|error| Failure::Data(format!("the answer was not understood: {error}")))
 }

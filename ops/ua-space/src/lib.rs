@@ -34,6 +34,7 @@ mod owl;
 mod packet;
 mod page;
 mod pea;
+mod plan;
 mod raw_data;
 mod recorded;
 mod report;
@@ -104,6 +105,7 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         },
         Verb::Page(_) => return page::page(given),
         Verb::Ask(arguments) => ask::ask(arguments),
+        Verb::Plan(arguments) => plan::plan(arguments),
         Verb::Source(arguments) => source::source(arguments),
         Verb::Rml(arguments) => rml::rml(arguments),
         Verb::Owl(arguments) => owl::owl(arguments),

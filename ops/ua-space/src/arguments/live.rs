@@ -286,6 +286,24 @@ pub(crate) struct Ask {
 }
 
 #[derive(Debug, Args)]
+pub(crate) struct PlanArguments {
+    /// The process: its IRI, its name, or the last part of its IRI
+    #[arg(value_name = "PROCESS")]
+    pub(crate) process: Option<String>,
+    /// The URL of ua-mes
+    #[arg(
+        long,
+        value_name = "URL",
+        env = "UA_SPARQL",
+        default_value = "http://127.0.0.1:8087"
+    )]
+    pub(crate) url: String,
+    /// Print the response of the MES
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
 pub(crate) struct Source {
     #[command(subcommand)]
     pub(crate) verb: SourceVerb,
