@@ -361,7 +361,7 @@ mod tests {
 
     const START: i128 = 1_700_000_000_000_000_000;
     const MS: i128 = 1_000_000;
-    /// The time from one host to the other.
+    /// The network delay between the two hosts.
     const DELAY: i128 = 400_000;
 
     /// Returns a value of a space that was sent at a time of the clock of its host.
@@ -462,7 +462,7 @@ mod tests {
             let error = (row.delays.p50_us - 400.0).abs();
             assert!(error < 200.0, "{} {}", row.topic, row.delays.p50_us);
         }
-        // One direction is no offset.
+        // Messages of a single direction give no offset.
         let one = Compared::of(&arrivals(&first), &arrivals(&first));
         let refused = Compared(one.0.into_iter().take(1).collect());
         let refused = refused.clock(&first, &first).err().unwrap().to_string();
