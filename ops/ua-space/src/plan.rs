@@ -155,7 +155,7 @@ fn show(body: &str, is_json: bool) -> Result<(), Failure> {
         false => Err(Failure::Failed(format!(
             "{} cannot run: {}",
             harmless(&planned.process),
-            harmless(&planned.missing)
+            harmless(&plain(&planned.missing))
         ))),
     }
 }
@@ -193,12 +193,28 @@ fn rows(planned: &Planned) -> Vec<[String; 6]> {
                     one.component_name.clone(),
                     one.name.clone(),
                     if one.chosen { "yes" } else { "no" }.to_owned(),
-                    one.why.clone(),
+                    plain(&one.why),
                 ]);
             }
         }
     }
     rows
+}
+
+/// Replaces the IRIs of a text by their last parts, so that it fits a line.
+fn plain(text: &str) -> String {
+    let words = text.split(' ').map(|word| {
+        let inner = word.trim_end_matches([',', ';', ')']);
+        let end = word.get(inner.len()..).unwrap_or_default();
+        match inner.strip_prefix("nsu=").and_then(|it| it.split_once(';')) {
+            Some((_, name)) => format!("{name}{end}"),
+            None if inner.starts_with("urn:") || inner.contains("://") => {
+                format!("{}{end}", short(inner))
+            }
+            None => word.to_owned(),
+        }
+    });
+    words.collect::<Vec<_>>().join(" ")
 }
 
 /// Returns the last part of an IRI.
@@ -214,7 +230,7 @@ mod tests {
         "plan": {"steps": [
           {"step": "grasp", "needs": [{"role": "skill", "capability": "urn:c#grasp", "type": null, "chosen": "urn:g#Grasp", "candidates": [
             {"skill": "urn:v#Grasp", "name": "Grasp", "component": "urn:v", "component_name": "vacuum", "chosen": false, "why": "a later component"},
-            {"skill": "urn:g#Grasp", "name": "Grasp", "component": "urn:g", "component_name": "gripper", "chosen": true, "why": "capability grasp"}]}]},
+            {"skill": "urn:g#Grasp", "name": "Grasp", "component": "urn:g", "component_name": "gripper", "chosen": true, "why": "it realises urn:example:capability:grasp, of nsu=urn:x;GraspSkillType"}]}]},
           {"step": "weigh", "needs": [{"role": "skill", "capability": "urn:c#weigh", "type": null, "chosen": null, "candidates": []}]}]}}"#;
 
     #[test]
@@ -224,7 +240,7 @@ mod tests {
         assert_eq!(
             rows,
             [
-                "grasp|grasp|gripper|Grasp|yes|capability grasp",
+                "grasp|grasp|gripper|Grasp|yes|it realises grasp, of GraspSkillType",
                 "||vacuum|Grasp|no|a later component",
                 "weigh|weigh|-|-|-|no skill provides it",
             ]
