@@ -137,7 +137,9 @@ def events(judge, url):
     """Waits for strips and rows, holds the view by the keyboard, and changes the period."""
     judge.look("light", WIDE)
     judge.open(url, "events")
-    rows = lambda: [one.get_attribute("data-id") for one in judge.driver.find_elements(By.CSS_SELECTOR, "tbody tr[data-id]")]
+    # The page replaces its rows meanwhile, so all are read at once.
+    rows = lambda: judge.driver.execute_script(
+        "return [...document.querySelectorAll('tbody tr[data-id]')].map((row) => row.dataset.id)")
     judge.wait("there are events", rows)
     judge.wait("there is a strip", lambda: judge.driver.find_elements(By.CSS_SELECTOR, ".gantt .event-bar"))
     first = rows()[0]
