@@ -333,7 +333,7 @@ def main():
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     judge = Judge(arguments.out, arguments.axe)
-    for scenario, more in [("line-by-topics", ["--covers", "12", "--conveyor-off-at", "600"]), ("assembly-line", ["--covers", "12"])]:
+    for scenario, more in [("line-by-topics", ["--covers", "40", "--conveyor-off-at", "600"]), ("assembly-line", ["--covers", "12"])]:
         command = [arguments.binaries / "demo", "--scenario", scenario, *more]
         demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         try:
