@@ -350,7 +350,7 @@ def main():
                 events(judge, url)
                 switch_off(judge, arguments.binaries, url, folder)
                 judge.open(url, "events")
-                judge.wait("the call is an event", lambda: "requested" in judge.text())
+                judge.wait("the call is an event", lambda: "answered" in judge.text())
                 judge.shoot("events-switched-off-light-wide")
             judge.console()
             judge.driver.get("about:blank")
