@@ -7,13 +7,15 @@ use std::process::ExitCode;
 use std::sync::{Arc, OnceLock};
 
 use bridge_node::{
-    Arguments, Context, Failure, FailureKind, KeyService, Made, Owned, Program, WithoutMapping,
+    Arguments, ConfigurationFile, Context, Failure, FailureKind, KeyService, Made, Owned, Program,
+    WithoutMapping,
 };
 use mappings::{Mapping, SpaceId};
 use plant_opcua::enrolment::GdsArguments;
 use skills::yaml::Code;
 use skills::{Component, Lds, Security};
 
+use crate::reload::{ComponentFile, Overrides, ReadComponent, Version};
 use crate::{ComponentPort, Options, made, simulate};
 
 /// A component of the cell: an OPC UA server with skills, which are values and calls of the space too.
@@ -77,7 +79,7 @@ struct UaComponent {
     #[command(flatten)]
     arguments: WithoutMapping,
     #[arg(skip)]
-    read: OnceLock<Read>,
+    read: OnceLock<Arc<ComponentFile>>,
 }
 
 /// The schemas that the program prints.
@@ -85,13 +87,6 @@ struct UaComponent {
 enum Schema {
     Component,
     Exec,
-}
-
-/// The YAML file that was read.
-#[derive(Debug)]
-struct Read {
-    component: Component,
-    text: String,
 }
 
 /// Runs `ua-component` from its command line to its end. `arguments` begin with the name of the
@@ -110,7 +105,7 @@ impl UaComponent {
         self.component.as_deref().unwrap_or_else(|| Path::new(""))
     }
 
-    fn read(&self) -> Result<&Read, Failure> {
+    fn read(&self) -> Result<&Arc<ComponentFile>, Failure> {
         if let Some(read) = self.read.get() {
             return Ok(read);
         }
@@ -118,36 +113,40 @@ impl UaComponent {
         let text = bridge_node::read_text_file(self.file()).map_err(|error| {
             Failure::new(FailureKind::Io, format!("cannot read {file}: {error}"))
         })?;
-        let folder = self.file().parent().unwrap_or_else(|| Path::new(""));
-        let mut component =
-            Component::from_yaml_with(&text, folder, &devices::Kinds).map_err(|findings| {
-                let count = findings.len();
-                crate::print(&findings.render(&file, &text));
-                Failure::new(
-                    FailureKind::Configuration,
-                    format!("{file}: {count} errors"),
-                )
-            })?;
-        if let Some(endpoint) = &self.endpoint {
-            component.endpoint.clone_from(endpoint);
-        }
-        if let Some(lds) = &self.lds {
-            component.lds = Lds::written(lds);
-        }
-        Ok(self.read.get_or_init(|| Read { component, text }))
+        let overrides = Overrides {
+            endpoint: self.endpoint.clone(),
+            lds: self.lds.as_deref().map(Lds::written),
+        };
+        let with_devices: ReadComponent =
+            |text, folder| Component::from_yaml_with(text, folder, &devices::Kinds);
+        let read = ComponentFile::new(self.file().to_owned(), text, with_devices, overrides);
+        let read = read.map_err(|(text, findings)| {
+            let count = findings.len();
+            crate::print(&findings.render(&file, &text));
+            Failure::new(
+                FailureKind::Configuration,
+                format!("{file}: {count} errors"),
+            )
+        })?;
+        Ok(self.read.get_or_init(|| Arc::new(read)))
+    }
+
+    fn component(&self) -> Result<&Component, Failure> {
+        Ok(&self.read()?.started().component)
     }
 
     /// Returns the path of the certificate store.
-    fn pki_root(&self, read: &Read) -> PathBuf {
+    fn pki_root(&self, component: &Component) -> PathBuf {
         let root = || plant_opcua::pki::default_root(|name| std::env::var(name).ok());
-        let usual = || root().join(&read.component.name);
+        let usual = || root().join(&component.name);
         self.pki.clone().unwrap_or_else(usual)
     }
 
-    fn options(&self, read: &Read) -> Options {
+    fn options(&self, file: &Arc<ComponentFile>) -> Options {
+        let Version { component, text } = &**file.started();
         let is_secured =
-            self.gds.gds.is_some() || read.component.security.contains(&Security::Basic256Sha256);
-        let usual = || self.pki_root(read);
+            self.gds.gds.is_some() || component.security.contains(&Security::Basic256Sha256);
+        let usual = || self.pki_root(component);
         let pki = self.pki.clone().or_else(|| is_secured.then(usual));
         let interface = self.arguments.0.flags.interface.as_deref();
         let mdns = match interface {
@@ -161,8 +160,9 @@ impl UaComponent {
             mdns: Some(mdns),
             capabilities: vec!["DA".to_owned()],
             gds: None,
-            configuration: Some(self.pki_root(read).join("configuration.json")),
-            source: Some((read.text.clone(), self.file().display().to_string())),
+            configuration: Some(self.pki_root(component).join("configuration.json")),
+            source: Some((text.clone(), self.file().display().to_string())),
+            file: Some(Arc::clone(file)),
         }
     }
 }
@@ -215,20 +215,25 @@ impl Program for UaComponent {
         }
         let read = self.read()?;
         if self.check {
-            crate::check(&read.component, &self.options(read))?;
+            crate::check(&read.started().component, &self.options(read))?;
             return Ok(Some(Made::Checked));
         }
-        Ok(Some(Made::Run(made(&read.component))))
+        Ok(Some(Made::Run(made(&read.started().component))))
+    }
+
+    fn configuration(&self) -> Option<Arc<dyn ConfigurationFile>> {
+        let file = Arc::clone(self.read().ok()?);
+        Some(file)
     }
 
     /// The key service uses the identity of the server and its clients, from the same certificate
     /// store.
     fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
-        let read = self.read().ok()?;
+        let component = self.component().ok()?;
         Some(Arc::new(plant_keys::Service::new(plant_keys::Identity {
-            application_uri: read.component.application_uri.clone(),
-            application_name: read.component.name.clone(),
-            pki: self.pki_root(read),
+            application_uri: component.application_uri.clone(),
+            application_name: component.name.clone(),
+            pki: self.pki_root(component),
         })))
     }
 
@@ -248,6 +253,6 @@ impl Program for UaComponent {
             gds,
             ..self.options(read)
         };
-        ComponentPort::start(&read.component, &options)
+        ComponentPort::start(&read.started().component, &options)
     }
 }

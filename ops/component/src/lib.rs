@@ -16,6 +16,7 @@ mod goals;
 mod mirrors;
 mod partners;
 mod port;
+mod reload;
 #[cfg(feature = "devices")]
 mod simulate;
 mod space;
@@ -24,3 +25,4 @@ mod work;
 
 pub use mirrors::{Foreign, ForeignFaults, ForeignSkills};
 pub use port::{ComponentPort, Options, check, made, print};
+pub use reload::{ComponentFile, Overrides, ReadComponent, Version};

@@ -20,9 +20,12 @@ use plant_opcua::own;
 use plant_opcua::supervision::Supervision;
 use program::{Method, State};
 use skills::server::{ComponentServer, PowerOff, ServeFault, ServeSettings};
-use skills::{Component, LiveValue, Owner, PeerAccess, Security, Skill, ValueSource};
+use skills::{
+    Authority, Component, DriverSetup, LiveValue, Owner, PeerAccess, Security, Skill, Takes,
+    ValueSource,
+};
 use tokio::sync::mpsc;
-use tokio::task::JoinSet;
+use tokio::task::{AbortHandle, JoinSet};
 use tracing::{info, warn};
 use uadp::BuiltinType;
 
@@ -31,6 +34,7 @@ use crate::executor::Executor;
 use crate::fields;
 use crate::goals::{self, Doer, Reporter};
 use crate::partners;
+use crate::reload::{ComponentFile, Version};
 use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
 use crate::topics::Topics;
 use crate::work::with_drivers;
@@ -53,6 +57,8 @@ pub struct Options {
     pub configuration: Option<PathBuf>,
     /// The text and the name of the YAML file, for findings.
     pub source: Option<(String, String)>,
+    /// The YAML file, which is read again while the component runs.
+    pub file: Option<Arc<ComponentFile>>,
 }
 
 /// Returns the mapping of a component, which has a single namespace and no variables.
@@ -87,6 +93,10 @@ pub struct ComponentPort {
     closing: Arc<Mutex<BTreeSet<String>>>,
     /// The certificate store.
     pki: Option<PathBuf>,
+    /// The YAML file and the version that drivers were made of last.
+    versions: Option<(Arc<ComponentFile>, Arc<Version>)>,
+    /// The wait for a restart, after a change that needs it.
+    restarting: Option<AbortOnDrop>,
 }
 
 impl ComponentPort {
@@ -143,7 +153,7 @@ impl ComponentPort {
         server.start();
         let told = told_of(component, server.url(), options);
         let application = application(&told, &component.security);
-        enrol(&mut looks, (component, &told), options, server.skills());
+        enrol(&mut looks, (component, &told), options, server.authority());
         let announced = announce(told, component, options, settings.supervision);
         if server.skills().len() > MOST_IN_SPACE {
             warn!(
@@ -174,6 +184,11 @@ impl ComponentPort {
             application,
             closing: Arc::default(),
             pki: options.pki.clone(),
+            versions: options.file.clone().map(|file| {
+                let started = Arc::clone(file.started());
+                (file, started)
+            }),
+            restarting: None,
         })
     }
 
@@ -187,6 +202,44 @@ impl ComponentPort {
     #[must_use]
     pub fn skills(&self) -> &[Skill] {
         self.server.skills()
+    }
+
+    /// Adopts the latest version of the YAML file. Returns the changes that only a restart by the
+    /// operator takes up.
+    fn adopt(&mut self) -> Vec<String> {
+        let Some((file, adopted)) = &mut self.versions else {
+            return Vec::new();
+        };
+        let latest = file.latest();
+        let names = replaced_drivers(adopted, &latest);
+        let component = Component {
+            values: Vec::new(),
+            ..latest.component.clone()
+        };
+        let component = with_drivers(&component, &mut self.asking, &mut self.topics);
+        if let Err(fault) = self.server.replace_drivers(&component, &names) {
+            // A change that needs a restart comes with it.
+            warn!("the drivers stay as they are until the restart: {fault}");
+        }
+        let changes = Component::changes(&file.started().text, &latest.text);
+        *adopted = latest;
+        let of = |takes: Takes| {
+            let changes = changes.iter().filter(move |change| change.takes == takes);
+            changes.map(|change| change.path.clone())
+        };
+        let by_operator: Vec<String> = of(Takes::Operator).collect();
+        let by_itself: Vec<String> = of(Takes::Restart).collect();
+        self.restarting = None;
+        if !by_operator.is_empty() {
+            return by_operator.into_iter().chain(by_itself).collect();
+        }
+        if !by_itself.is_empty() {
+            let authority = self.server.authority().clone();
+            let why = format!("with {}", by_itself.join(", "));
+            let waits = tokio::spawn(restart_when_idle(authority, why));
+            self.restarting = Some(AbortOnDrop(waits.abort_handle()));
+        }
+        Vec::new()
     }
 
     fn skill(&self, topic: TopicId) -> Option<(Skill, Method)> {
@@ -315,7 +368,7 @@ impl Port for ComponentPort {
     }
 
     fn reload(&mut self, _mapping: &Arc<Mapping>, _types: &Arc<TypePaths>) -> Vec<String> {
-        Vec::new()
+        self.adopt()
     }
 
     fn closing(&mut self) {
@@ -366,6 +419,12 @@ impl Port for ComponentPort {
 /// # Errors
 /// Returns the errors of [`ComponentPort::start`].
 pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
+    built_and_stopped(component)?.map_err(|fault| failure(fault, options))
+}
+
+/// Builds the server of a component in a runtime of its own, and stops it. Its tasks, such as the
+/// measurements of values, never run.
+pub(crate) fn built_and_stopped(component: &Component) -> Result<Result<(), ServeFault>, Failure> {
     let component = Component {
         endpoint: "opc.tcp://127.0.0.1:0".to_owned(),
         security: vec![Security::None],
@@ -378,10 +437,48 @@ pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
     runtime.block_on(async {
         let settings = ServeSettings::default();
         let built = ComponentServer::build(&component, &settings, |_, _| Vec::new());
-        let server = built.map_err(|fault| failure(fault, options))?;
-        server.stop().await;
-        Ok(())
+        Ok(match built {
+            Ok(server) => {
+                server.stop().await;
+                Ok(())
+            }
+            Err(fault) => Err(fault),
+        })
     })
+}
+
+/// Returns the skills whose drivers or time limits differ between two versions, and take effect at
+/// the next run.
+fn replaced_drivers(before: &Version, after: &Version) -> Vec<String> {
+    let changes = Component::changes(&before.text, &after.text);
+    let next_run = || {
+        changes
+            .iter()
+            .filter(|change| change.takes == Takes::NextRun)
+    };
+    let mut names = Vec::new();
+    for skill in &after.component.skills {
+        let is_changed = next_run().any(|change| {
+            let parts = change.path.strip_prefix("skills.");
+            let name = parts.and_then(|parts| parts.split('.').next());
+            name == Some(skill.name.as_str())
+        });
+        // Composites look up objects in the world.
+        let is_composite = matches!(skill.driver, DriverSetup::PickAndPlace(_));
+        if is_changed || (is_composite && next_run().any(|change| change.path == "world")) {
+            names.push(skill.name.clone());
+        }
+    }
+    names
+}
+
+/// A task that ends when this value is dropped.
+struct AbortOnDrop(AbortHandle);
+
+impl Drop for AbortOnDrop {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -486,7 +583,7 @@ fn enrol(
     tasks: &mut JoinSet<()>,
     (component, announced): (&Component, &discovery::Server),
     options: &Options,
-    skills: &[Skill],
+    authority: &Authority,
 ) {
     let (Some(root), Some(gds)) = (&options.pki, &options.gds) else {
         return;
@@ -496,24 +593,27 @@ fn enrol(
     let urls = endpoint.zip(port.ok()).map(|(url, port)| url.urls(port));
     let applicant = announced.applicant(urls.unwrap_or_default());
     let enrolment = Enrolment::new(root, applicant, gds.clone());
-    let skills = skills.to_vec();
+    let authority = authority.clone();
     tasks.spawn(async move {
         enrolment
-            .keep(|| drop(tokio::spawn(restart_when_idle(skills.clone()))))
+            .keep(|| {
+                let why = "with its new certificate".to_owned();
+                drop(tokio::spawn(restart_when_idle(authority.clone(), why)));
+            })
             .await;
     });
 }
 
-/// Restarts the program when no skill runs, because a restart for a certificate must not stop a
-/// machine.
-async fn restart_when_idle(skills: Vec<Skill>) {
-    let runs = |skill: &Skill| matches!(skill.shown().state, State::Running | State::Suspended);
-    if skills.iter().any(runs) {
-        info!("the program restarts with its new certificate when no skill runs");
+/// Restarts the program when no skill runs and no client holds the lease, because a restart must
+/// not stop a machine or part a composite. No run starts after that.
+async fn restart_when_idle(authority: Authority, why: String) {
+    if !authority.reserve() {
+        info!("the program restarts {why} when no skill runs and no client holds the lease");
+        while !authority.reserve() {
+            tokio::time::sleep(IDLE_LOOK).await;
+        }
     }
-    while skills.iter().any(runs) {
-        tokio::time::sleep(IDLE_LOOK).await;
-    }
+    info!("the program restarts {why}");
     bridge_node::restart();
 }
 

@@ -313,6 +313,7 @@ impl UaMes {
             gds: None,
             configuration: None,
             source: None,
+            file: None,
         }
     }
 

@@ -84,26 +84,19 @@ impl Device for Robot {
     ) -> Result<Arc<dyn Driver>, DriverFault> {
         let is = |name: &str| types.contains(&TypeName::own(name));
         let settings = Arc::clone(&self.settings);
-        let motion = |linear, guarded| -> Arc<dyn Driver> {
-            Arc::new(Motion {
-                settings,
-                linear,
-                guarded,
-            })
-        };
-        if is("PtpMoveSkillType") {
-            return Ok(motion(false, false));
-        }
-        // A subtype of LinearMoveSkillType.
-        if is("ForceMoveSkillType") {
-            return Ok(motion(true, true));
-        }
-        if is("LinearMoveSkillType") {
-            return Ok(motion(true, false));
+        // ForceMoveSkillType is a subtype of LinearMoveSkillType.
+        let kinds = [
+            ("PtpMoveSkillType", Kind::Ptp),
+            ("ForceMoveSkillType", Kind::Guarded),
+            ("LinearMoveSkillType", Kind::Linear),
+            ("JointPtpMoveSkillType", Kind::Joints),
+        ];
+        if let Some((_, kind)) = kinds.into_iter().find(|(name, _)| is(name)) {
+            return Ok(Arc::new(Motion { settings, kind }));
         }
         let own = types.first().map(TypeName::to_string).unwrap_or_default();
         Err(DriverFault(format!(
-            "`universal_robot` does the work of PtpMoveSkillType, LinearMoveSkillType, ForceMoveSkillType and what is below them, and this is {own}"
+            "`universal_robot` does the work of PtpMoveSkillType, LinearMoveSkillType, ForceMoveSkillType, JointPtpMoveSkillType and what is below them, and this is {own}"
         )))
     }
 
@@ -206,9 +199,20 @@ const fn six(name: &'static str, unit: Option<&'static str>, about: &'static str
 #[derive(Debug)]
 struct Motion {
     settings: Arc<Settings>,
-    linear: bool,
-    /// Whether the move ends at the force of the parameter MaxForce.
-    guarded: bool,
+    kind: Kind,
+}
+
+/// The kind of a move.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    /// From point to point to a pose of the tool.
+    Ptp,
+    /// Along a straight line of the tool.
+    Linear,
+    /// Along a straight line that ends at the force of the parameter MaxForce.
+    Guarded,
+    /// From point to point to positions of the joints.
+    Joints,
 }
 
 /// State of the robot.
@@ -226,9 +230,11 @@ struct State {
     done: i32,
     /// Force and torque at the tool, in the frame of the base.
     force: [f64; 6],
+    /// Positions of the joints, rad.
+    joints: [f64; 6],
 }
 
-const OUTPUTS: [&str; 9] = [
+const OUTPUTS: [&str; 10] = [
     "actual_TCP_pose",
     "actual_TCP_speed",
     "robot_mode",
@@ -238,6 +244,7 @@ const OUTPUTS: [&str; 9] = [
     "output_int_register_24",
     "output_int_register_25",
     "actual_TCP_force",
+    "actual_q",
 ];
 const INPUTS: [&str; 2] = ["speed_slider_mask", "speed_slider_fraction"];
 
@@ -253,6 +260,7 @@ impl State {
             Value::I32(started),
             Value::I32(done),
             Value::Vector(force),
+            Value::Vector(joints),
         ] = values
         else {
             return None;
@@ -267,6 +275,7 @@ impl State {
             started: *started,
             done: *done,
             force: *force,
+            joints: *joints,
         })
     }
 
@@ -294,6 +303,9 @@ impl Driver for Motion {
     }
 
     fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        if self.kind == Kind::Joints {
+            return joint_target(parameters).map(drop);
+        }
         let target = parameters.six("TargetPosition");
         let [x, y, z, ..] = target.ok_or("TargetPosition has no six numbers")?;
         let (far, reach) = ((x * x + y * y + z * z).sqrt(), self.settings.reach);
@@ -302,7 +314,7 @@ impl Driver for Motion {
                 "TargetPosition is {far:.3} m from the base, and the robot reaches {reach} m"
             ));
         }
-        if self.guarded {
+        if self.kind == Kind::Guarded {
             Guard::of(parameters)?;
         }
         match parameters.text("ToolFrame") {
@@ -312,11 +324,10 @@ impl Driver for Motion {
     }
 
     async fn run(&self, work: Work) -> Result<Results, String> {
-        let mut guard = match self.guarded {
-            true => Some(Guard::of(work.parameters())?),
-            false => None,
+        let (mut guard, hertz) = match self.kind {
+            Kind::Guarded => (Some(Guard::of(work.parameters())?), GUARDED),
+            Kind::Ptp | Kind::Linear | Kind::Joints => (None, HERTZ),
         };
-        let hertz = if self.guarded { GUARDED } else { HERTZ };
         let mut session = Session::open(&self.settings, hertz).await?;
         let at = session.state().await?;
         at.fit()?;
@@ -329,7 +340,12 @@ impl Driver for Motion {
             guard.zero(at.force);
         }
         let ended = session.follow((self, &work), token, &mut guard).await?;
-        let mut results = vec![("Position".to_owned(), of_robot(ended.pose).into())];
+        let mut results = match self.kind {
+            Kind::Joints => vec![("JointPosition".to_owned(), ended.joints.into())],
+            Kind::Ptp | Kind::Linear | Kind::Guarded => {
+                vec![("Position".to_owned(), of_robot(ended.pose).into())]
+            }
+        };
         if let Some(guard) = guard {
             results.extend(guard.results());
         }
@@ -341,23 +357,39 @@ impl Motion {
     fn program(&self, parameters: &Parameters, token: i32) -> Result<String, String> {
         let missing = |name: &str| format!("{name} is not there");
         let number = |name: &str| parameters.number(name).ok_or_else(|| missing(name));
-        let target = parameters
-            .six("TargetPosition")
-            .ok_or_else(|| missing("TargetPosition"))?;
-        let (speed, acceleration) = (number("MaxVelocity")?, number("MaxAcceleration")?);
-        let [x, y, z, rx, ry, rz] = to_robot(target);
-        let pose = format!("p[{x:.6}, {y:.6}, {z:.6}, {rx:.6}, {ry:.6}, {rz:.6}]");
-        // The speed of a PTP move is that of the joints. At full reach three joints may add up
-        // before the tool is too fast.
-        let (verb, by) = match self.linear {
-            true => ("movel", 1.0),
-            false => ("movej", 3.0 * self.settings.reach),
+        let line = |target: &str, verb: &str, (a, v): (f64, f64)| {
+            format!("{verb}({target}, a={a:.4}, v={v:.4})")
         };
-        let (a, v) = (acceleration / by, speed / by);
+        let move_to = if self.kind == Kind::Joints {
+            let target = listed(joint_target(parameters)?);
+            let limits = (number("MaxJointAcceleration")?, number("MaxJointVelocity")?);
+            line(&format!("[{target}]"), "movej", limits)
+        } else {
+            let target = parameters
+                .six("TargetPosition")
+                .ok_or_else(|| missing("TargetPosition"))?;
+            let pose = listed(to_robot(target));
+            // The speed of a PTP move is that of the joints. At full reach three joints may add up
+            // before the tool is too fast.
+            let (verb, by) = match self.kind {
+                Kind::Linear | Kind::Guarded => ("movel", 1.0),
+                Kind::Ptp | Kind::Joints => ("movej", 3.0 * self.settings.reach),
+            };
+            let limits = (number("MaxAcceleration")? / by, number("MaxVelocity")? / by);
+            line(&format!("p[{pose}]"), verb, limits)
+        };
         Ok(format!(
-            "def ua_skill():\n  write_output_integer_register(24, {token})\n  {verb}({pose}, a={a:.4}, v={v:.4})\n  \
+            "def ua_skill():\n  write_output_integer_register(24, {token})\n  {move_to}\n  \
              write_output_integer_register(25, {token})\nend\n"
         ))
+    }
+
+    /// Returns the program that stops the robot along its path.
+    fn stop_program(&self) -> &'static str {
+        match self.kind {
+            Kind::Joints => HALT_JOINTS,
+            Kind::Ptp | Kind::Linear | Kind::Guarded => HALT,
+        }
     }
 
     /// Sends a program. The connection has to stay open until the robot has accepted the program.
@@ -375,7 +407,7 @@ impl Motion {
     /// Stops a robot that moves and whose state is not received. Returns the reason with what was
     /// done.
     async fn lost(&self, work: &Work, why: &str) -> String {
-        let stopped = match self.send(HALT).await {
+        let stopped = match self.send(self.stop_program()).await {
             Ok(program) => {
                 sleep(SETTLED).await;
                 drop(program);
@@ -385,6 +417,23 @@ impl Motion {
         };
         unknown(work, why, &stopped).await
     }
+}
+
+/// Returns the target of a joint move, rad.
+fn joint_target(parameters: &Parameters) -> Result<[f64; 6], String> {
+    let target = parameters.six("TargetJointPosition");
+    let target = target.ok_or("TargetJointPosition has no six numbers")?;
+    match target.iter().find(|joint| joint.abs() > MOST_TURNED) {
+        Some(joint) => Err(format!(
+            "TargetJointPosition has {joint} rad, and the joints turn by {MOST_TURNED:.4} rad to each side"
+        )),
+        None => Ok(target),
+    }
+}
+
+/// Returns six numbers as elements of a list of URScript.
+fn listed(numbers: [f64; 6]) -> String {
+    numbers.map(|number| format!("{number:.6}")).join(", ")
 }
 
 /// Reports that the robot may move. Returns the reason with what was done.
@@ -513,7 +562,7 @@ impl Session {
         (motion, work): (&Motion, &Work),
         slider: Option<f64>,
     ) -> Result<State, String> {
-        let _program = match motion.send(HALT).await {
+        let _program = match motion.send(motion.stop_program()).await {
             Ok(program) => program,
             Err(why) => return Err(unknown(work, &why, NOT_SENT).await),
         };
@@ -583,6 +632,10 @@ async fn is(ready: impl Future<Output = ()>) -> bool {
 
 /// The program that stops the robot along its path.
 const HALT: &str = "def ua_halt():\n  stopl(3.0)\nend\n";
+/// The same for a move of the joints.
+const HALT_JOINTS: &str = "def ua_halt():\n  stopj(3.0)\nend\n";
+/// Largest position of a joint to each side, rad: a full turn.
+const MOST_TURNED: f64 = std::f64::consts::TAU;
 const SENT: &str = "the stop program is sent";
 const NOT_SENT: &str = "the stop program is not sent";
 /// `runtime_state` of a running program.

@@ -117,6 +117,12 @@ impl Program {
         }
     }
 
+    /// Sets whether the work can be suspended, for work that is done in another way from the next
+    /// run on.
+    pub fn set_can_suspend(&mut self, can_suspend: bool) {
+        self.nature.can_suspend = can_suspend;
+    }
+
     /// Calls a method and returns the resulting transition.
     ///
     /// # Errors

@@ -2,6 +2,7 @@
 
 use std::any::Any;
 use std::collections::VecDeque;
+use std::fmt;
 use std::future::pending;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime};
@@ -49,9 +50,27 @@ pub(crate) struct Given {
     pub(crate) readies: bool,
 }
 
+/// The driver and the time limit of the next runs.
+pub(crate) struct Successor {
+    pub(crate) driver: Arc<dyn Driver>,
+    pub(crate) timeout: Option<Duration>,
+}
+
+impl fmt::Debug for Successor {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut shown = f.debug_struct("Successor");
+        shown
+            .field("timeout", &self.timeout)
+            .finish_non_exhaustive()
+    }
+}
+
 pub(crate) struct Actor {
     facts: Arc<Facts>,
     driver: Arc<dyn Driver>,
+    /// Time limit of a run.
+    timeout: Option<Duration>,
+    successor: Arc<Mutex<Option<Successor>>>,
     authority: Authority,
     pending: Arc<Mutex<Pending>>,
     outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
@@ -114,6 +133,7 @@ impl Actor {
         authority: Authority,
         (pending, outcomes): Store,
         (observers, first_run): (Vec<Box<dyn Observer>>, u32),
+        successor: Arc<Mutex<Option<Successor>>>,
     ) -> (Self, watch::Receiver<Arc<Shown>>) {
         let nature = Nature {
             can_suspend: driver.can_suspend(),
@@ -140,8 +160,10 @@ impl Actor {
         };
         let (shown, watched) = watch::channel(Arc::new(now.clone()));
         let actor = Self {
+            timeout: facts.timeout,
             facts,
             driver,
+            successor,
             authority,
             pending,
             outcomes,
@@ -296,10 +318,8 @@ impl Actor {
         {
             return Err(still_at_work(work.run));
         }
-        let within = [given.within, self.facts.timeout]
-            .into_iter()
-            .flatten()
-            .min();
+        self.adopt_successor();
+        let within = [given.within, self.timeout].into_iter().flatten().min();
         let given = given
             .parameters
             .unwrap_or_else(|| lock(&self.pending).given(by));
@@ -340,6 +360,15 @@ impl Actor {
             unknown: None,
         });
         Ok(())
+    }
+
+    /// Adopts a replaced driver. Called while there is no work.
+    fn adopt_successor(&mut self) {
+        if let Some(Successor { driver, timeout }) = lock(&self.successor).take() {
+            self.program.set_can_suspend(driver.can_suspend());
+            self.driver = driver;
+            self.timeout = timeout;
+        }
     }
 
     /// Performs the transition to Running, from Halted by way of Ready.

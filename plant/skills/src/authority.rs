@@ -173,6 +173,18 @@ impl Authority {
         Ok(())
     }
 
+    /// Reserves the component for its end if no skill runs and no client holds the lease: later
+    /// runs are refused. Returns whether it is reserved.
+    #[must_use]
+    pub fn reserve(&self) -> bool {
+        let mut inner = self.lock();
+        let is_free = inner.running.is_none() && inner.lease.holder().is_none();
+        if is_free {
+            inner.running = Some("the restart".to_owned());
+        }
+        is_free
+    }
+
     /// Records the end of the run of the skill.
     pub(crate) fn end(&self, skill: &str) {
         let mut inner = self.lock();
@@ -243,5 +255,18 @@ mod tests {
         assert_eq!(after(61), Some(OTHER), "the lock has ended");
         authority.claim(&Owner::Local("mes")).unwrap();
         assert_eq!(after(600), None, "not a session's");
+    }
+    #[test]
+    fn a_component_is_reserved_only_while_nobody_uses_it_and_then_starts_nothing() {
+        let authority = Authority::new();
+        authority.claim(&ME).unwrap();
+        assert!(!authority.reserve(), "a client has the lease");
+        authority.begin("Grasp").unwrap();
+        authority.release(&ME);
+        assert!(!authority.reserve(), "a run goes on");
+        authority.end("Grasp");
+        assert!(authority.reserve());
+        let refused = authority.begin("Grasp").unwrap_err();
+        assert_eq!(refused.code, Code::InvalidState, "{refused}");
     }
 }

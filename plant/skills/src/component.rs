@@ -1,5 +1,6 @@
 //! Describes a component: its name, its address and its skills.
 
+mod changes;
 mod configurable;
 mod device;
 mod document;
@@ -17,6 +18,7 @@ use plant_opcua::client::ClientUser;
 use plant_opcua::limits::ClientLimits;
 use plant_opcua::users::{Role, Roles};
 
+pub use changes::{Change, ChangeKind, Takes};
 pub(crate) use device::DeviceSensor;
 pub use device::{Device, DeviceKinds, NoDevices, measure_device};
 pub use document::{read_partner, read_user};

@@ -34,11 +34,11 @@ pub use client::{
     PeerAccess, RemoteState, SkillClient, SkillHandle, SkillStates, ToolState, Watchable,
 };
 pub use component::{
-    Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, ExecSource, ExecWork,
-    Form, LEASE, Lds, MOST_SKILLS, MOST_VALUES, NoDevices, Part, Partner, Partners, Robot,
-    Security, SensorRead, Simulation, SkillSetup, Source, SpaceWork, TopicSource, ValueSetup,
-    ValueSource, World, WorldObject, anonymous_by_default, measure_device, read_numbers,
-    read_partner, read_shape, read_user,
+    Asked, Change, ChangeKind, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers,
+    ExecSource, ExecWork, Form, LEASE, Lds, MOST_SKILLS, MOST_VALUES, NoDevices, Part, Partner,
+    Partners, Robot, Security, SensorRead, Simulation, SkillSetup, Source, SpaceWork, Takes,
+    TopicSource, ValueSetup, ValueSource, World, WorldObject, anonymous_by_default, measure_device,
+    read_numbers, read_partner, read_shape, read_user,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use configuration::{Configurable, Configuration, Effect, NotConfigured};

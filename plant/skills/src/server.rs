@@ -54,7 +54,7 @@ use self::values::Tallies;
 pub use self::values::status as value_status;
 use crate::authority::{Authority, Owner};
 use crate::client::PeerAccess;
-use crate::component::{Component, Drivers, Security, SkillSetup};
+use crate::component::{Component, DriverFault, Drivers, Security, SkillSetup};
 use crate::configuration::Configuration;
 use crate::driver::Driver;
 use crate::model::{self, NAMESPACE};
@@ -111,6 +111,8 @@ pub struct ComponentServer {
     authority: Authority,
     skills: Vec<Skill>,
     values: Vec<LiveValue>,
+    drivers: Drivers,
+    configuration: Configuration,
     tasks: JoinSet<()>,
 }
 
@@ -138,8 +140,8 @@ impl ComponentServer {
             .node("Skills")
             .cloned()
             .ok_or_else(|| ServeFault::Space("it has no folder Skills".to_owned()))?;
-        let drivers = Drivers::new(component, settings.peers.clone());
-        let (made, mut findings) = make_all(&server, component, &folder, drivers, &mut ids);
+        let mut drivers = Drivers::new(component, settings.peers.clone());
+        let (made, mut findings) = make_all(&server, component, &folder, &mut drivers, &mut ids);
         let tallies = Tallies::of(component);
         let values = values::made(component, &tallies);
         findings.extend(values.as_ref().err().cloned());
@@ -202,8 +204,41 @@ impl ComponentServer {
             authority,
             skills,
             values,
+            drivers,
+            configuration,
             tasks,
         })
+    }
+
+    /// Replaces the drivers and time limits of the named skills by those of `component`, and the
+    /// objects of the cell, from the next run of each skill on. Runs in progress keep theirs. Names
+    /// of skills that are not served with the same type are ignored.
+    ///
+    /// # Errors
+    /// A driver cannot do the work of its skill; nothing is replaced.
+    pub fn replace_drivers(
+        &mut self,
+        component: &Component,
+        names: &[String],
+    ) -> Result<(), DriverFault> {
+        self.drivers.set_world(Arc::clone(&component.world));
+        let mut made = Vec::new();
+        for setup in &component.skills {
+            let served = self.skills.iter().find(|skill| {
+                let facts = skill.facts();
+                facts.name == setup.name && facts.types.first() == Some(&setup.skill_type)
+            });
+            let Some(skill) = served.filter(|_| names.contains(&setup.name)) else {
+                continue;
+            };
+            let driver = self.drivers.make(&setup.driver, &skill.facts().types)?;
+            let driver = self.configuration.applied(&setup.name, driver);
+            made.push((skill, driver, setup.timeout));
+        }
+        for (skill, driver, timeout) in made {
+            skill.replace(driver, timeout);
+        }
+        Ok(())
     }
 
     /// Starts serving clients.
@@ -332,13 +367,13 @@ fn make_all(
     server: &Server,
     component: &Component,
     folder: &NodeId,
-    mut drivers: Drivers,
+    drivers: &mut Drivers,
     ids: &mut IdRange,
 ) -> (Vec<Made>, Findings) {
     let mut findings = Findings::default();
     let mut made = Vec::new();
     for (number, setup) in (1..).zip(&component.skills) {
-        match make(server, (number, setup), folder, &mut drivers, ids) {
+        match make(server, (number, setup), folder, drivers, ids) {
             Ok(skill) => made.push(skill),
             Err(finding) => findings.push(finding),
         }
@@ -728,5 +763,33 @@ mod tests {
             "{}",
             findings(&missing)
         );
+    }
+    #[tokio::test]
+    async fn drivers_are_replaced_all_or_none() {
+        let mut component = example("parallel-gripper.yaml");
+        let mut served = served(&component).unwrap();
+        let names: Vec<String> = ["Grasp", "Release"].map(str::to_owned).into();
+        component.skills[1].driver = crate::component::DriverSetup::Device;
+        component.skills[0].timeout = Some(Duration::from_millis(1));
+        let fault = served.replace_drivers(&component, &names).unwrap_err();
+        assert!(fault.to_string().contains("no `device`"), "{fault}");
+        let grasp = served.skills()[0].clone();
+        let me = Owner::Session(1);
+        let ends = async |run: u32| {
+            let mut watch = grasp.watch();
+            let ended = watch.wait_for(|shown| {
+                let outcome = shown.outcome.as_ref();
+                outcome.is_some_and(|outcome| outcome.run == run)
+            });
+            let ended = tokio::time::timeout(Duration::from_secs(30), ended).await;
+            ended.unwrap().unwrap().outcome.clone().unwrap()
+        };
+        let run = grasp.execute(me.clone(), Vec::new(), None).await.unwrap();
+        assert!(ends(run).await.succeeded, "the limit is not replaced");
+        served.replace_drivers(&component, &names[..1]).unwrap();
+        let run = grasp.execute(me, Vec::new(), None).await.unwrap();
+        let outcome = ends(run).await;
+        assert!(outcome.message.contains("within 1ms"), "{outcome:?}");
+        served.stop().await;
     }
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use program::{Method, Rest, State};
 use tokio::sync::{mpsc, oneshot, watch};
 
-use crate::actor::{Actor, Call, Given, Order};
+use crate::actor::{Actor, Call, Given, Order, Successor};
 use crate::authority::{Authority, Owner};
 use crate::driver::Driver;
 use crate::parameters::{Parameter, Parameters, TypeName, shortened};
@@ -44,6 +44,7 @@ pub struct Skill {
     orders: mpsc::Sender<Order>,
     shown: watch::Receiver<Arc<Shown>>,
     outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
+    successor: Arc<Mutex<Option<Successor>>>,
 }
 
 /// The parameters that an owner has written for the next run. A write by another owner discards
@@ -98,12 +99,14 @@ impl Skill {
         let facts = Arc::new(facts);
         let pending = Arc::new(Mutex::new(Pending::default()));
         let outcomes = Arc::default();
+        let successor = Arc::default();
         let (orders, waiting) = mpsc::channel(MOST_ORDERS);
         let (actor, shown) = Actor::new(
             (Arc::clone(&facts), driver),
             authority.clone(),
             (Arc::clone(&pending), Arc::clone(&outcomes)),
             (observers, first_run),
+            Arc::clone(&successor),
         );
         drop(tokio::spawn(actor.run(waiting)));
         Self {
@@ -113,7 +116,14 @@ impl Skill {
             orders,
             shown,
             outcomes,
+            successor,
         }
+    }
+
+    /// Replaces the driver and the time limit from the next run on. A run in progress keeps its
+    /// driver and its limit.
+    pub fn replace(&self, driver: Arc<dyn Driver>, timeout: Option<Duration>) {
+        *lock(&self.successor) = Some(Successor { driver, timeout });
     }
 
     /// Returns the description of the skill.

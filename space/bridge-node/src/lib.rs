@@ -53,7 +53,7 @@ pub use executing::{Executing, ExecutorGraph};
 pub use exit::{Failure, FailureKind};
 pub use keys::{Fetched, Fetching, KeyRequest, KeyService};
 pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
-pub use mapping_file::NodeSetReader;
+pub use mapping_file::{ConfigurationFile, NodeSetReader};
 pub use mappings::harmless_json;
 pub use metrics::{BoxFuture, PageBody, Requests, Site, Statuses, Told, Visit, full, serve_pages};
 pub use observer::Observer;

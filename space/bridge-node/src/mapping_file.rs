@@ -1,5 +1,6 @@
 //! The mapping file, which users edit while the program runs.
 
+mod configuration;
 mod look;
 
 use std::cell::{Cell, RefCell};
@@ -23,6 +24,7 @@ use tokio::time::sleep;
 use tracing::{error, info, warn};
 use type_files::{Environment, TypeFiles, TypePaths};
 
+pub use self::configuration::ConfigurationFile;
 use self::look::{Before, Look, Seen, see};
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
@@ -55,6 +57,10 @@ pub(crate) struct About {
     refused: u64,
     /// The reason why the file is newer than the running mapping.
     stale: Option<String>,
+    /// The changes of the last adopted reload, a line each, of a program with a configuration of
+    /// its own.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    changes: Vec<String>,
 }
 
 impl About {
@@ -137,11 +143,7 @@ fn read(
     }
     // The content of the NodeSets counts as content of the mapping.
     all.update(disk.nodesets.1.get().to_le_bytes());
-    let mut hash = String::new();
-    for byte in all.finalize().iter().take(8) {
-        // Writing to a string does not fail.
-        let _written = write!(hash, "{byte:02x}");
-    }
+    let hash = shortened(all);
     let defined = checked.types.iter();
     let defined = defined.filter(|used| matches!(used.source, TypeOrigin::File(_)));
     let defined = defined.map(key).collect();
@@ -154,6 +156,16 @@ fn read(
         known: defined,
         files: disk.seen.into_inner(),
     })
+}
+
+/// Returns the first 8 bytes of a hash in hexadecimal.
+fn shortened(all: Sha256) -> String {
+    let mut hash = String::new();
+    for byte in all.finalize().iter().take(8) {
+        // Writing to a string does not fail.
+        let _written = write!(hash, "{byte:02x}");
+    }
+    hash
 }
 
 fn key(used: &TypeUse) -> (Dialect, TextKind, TypeName) {
@@ -229,6 +241,8 @@ impl Surroundings for Disk<'_> {
 #[derive(Debug)]
 pub(crate) struct MappingFile {
     file: Option<PathBuf>,
+    /// The configuration of a program without a mapping, which is in `file`.
+    configuration: Option<Arc<dyn ConfigurationFile>>,
     /// The reader of the NodeSets that the mapping names.
     nodesets: Option<NodeSetReader>,
     /// The files as they were when they were last read.
@@ -258,6 +272,7 @@ impl MappingFile {
         };
         Self {
             file: None,
+            configuration: None,
             nodesets: None,
             files: Arc::default(),
             hash: String::new(),
@@ -316,6 +331,7 @@ impl MappingFile {
                 };
                 Ok(Some(Self {
                     file: Some(file.to_owned()),
+                    configuration: None,
                     nodesets,
                     files: Arc::new(reading.files),
                     hash: reading.hash,
@@ -354,6 +370,11 @@ impl MappingFile {
     /// handful of system calls, and it is needed anyway to wait until a file is written completely.
     /// There may be thousands of definitions, so each poll checks a bounded number of them in turn.
     pub(crate) async fn follow(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
+        if let Some(configuration) = self.configuration.clone() {
+            return self
+                .follow_configuration(configuration, hangup, shells)
+                .await;
+        }
         let mut pause = Duration::ZERO;
         let mut before = Before::default();
         let mut turn = 0_usize;

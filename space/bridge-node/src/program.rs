@@ -28,7 +28,7 @@ use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
 use crate::keys::{KeyRing, KeyService};
 use crate::logging;
-use crate::mapping_file::{MappingFile, NodeSetReader, Running};
+use crate::mapping_file::{ConfigurationFile, MappingFile, NodeSetReader, Running};
 use crate::metrics::{self, Requests, Site};
 use crate::observer::Observer;
 use crate::port::Port;
@@ -76,6 +76,12 @@ pub trait Program: Parser {
     /// The configuration cannot run. Its faults have been printed.
     fn made(&self) -> Result<Option<Made>, Failure> {
         Ok(None)
+    }
+
+    /// Returns the file of the configuration of [`made`](Self::made), which is followed like a
+    /// mapping. Called after `made`.
+    fn configuration(&self) -> Option<Arc<dyn ConfigurationFile>> {
+        None
     }
 
     /// Returns the namespaces of its space that only this program writes. Called again when the
@@ -189,7 +195,7 @@ pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCod
         Ok(spaces)
     };
     let mapping = match program.made() {
-        Ok(Some(Made::Run(made))) => Ok(Some(MappingFile::none(made))),
+        Ok(Some(Made::Run(made))) => Ok(Some(MappingFile::made(made, program.configuration()))),
         Ok(Some(Made::Checked)) => Ok(None),
         Ok(None) => MappingFile::open((mapping, P::NODESETS), arguments.check, spaces),
         Err(failure) => Err(failure),

@@ -1,5 +1,6 @@
-//! Restarts the program in the same process with the same arguments, because libraries read the
-//! certificate of a server only once.
+//! Restarts the program in the same process with the same arguments: libraries read the
+//! certificate of a server only once, and the address space of a component follows its file at the
+//! start.
 //!
 //! The program ends as after SIGTERM, with goodbyes to the space and to clients, and then executes
 //! its own file again. The process id stays the same.
@@ -23,7 +24,7 @@ pub fn restart() {
     }
     if let Err(error) = kill_process(getpid(), Signal::TERM) {
         REQUESTED.store(false, Ordering::Relaxed);
-        warn!(%error, "cannot restart this program: restart it by hand, so that it uses its new certificate");
+        warn!(%error, "cannot restart this program: restart it by hand");
     }
 }
 

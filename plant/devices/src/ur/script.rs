@@ -10,6 +10,12 @@ pub(crate) enum Statement {
         acceleration: f64,
         speed: f64,
     },
+    /// `movej` to positions of the joints, rad.
+    Turn {
+        to: [f64; 6],
+        acceleration: f64,
+        speed: f64,
+    },
     /// `stopl` and `stopj`
     Stop,
     /// `write_output_integer_register`
@@ -70,8 +76,13 @@ fn read(line: &str) -> Option<Statement> {
     let inner = rest.trim_end().strip_suffix(')')?;
     Some(match name.trim() {
         verb @ ("movel" | "movej") => {
-            let (pose, rest) = inner.trim().strip_prefix("p[")?.split_once(']')?;
-            let to = six(pose)?;
+            let inner = inner.trim();
+            let (target, is_pose) = match inner.strip_prefix("p[") {
+                Some(pose) => (pose, true),
+                None => (inner.strip_prefix('[')?, false),
+            };
+            let (target, rest) = target.split_once(']')?;
+            let to = six(target)?;
             let given: Vec<&str> = rest
                 .split(',')
                 .map(str::trim)
@@ -89,11 +100,22 @@ fn read(line: &str) -> Option<Statement> {
                 }
             };
             let linear = verb == "movel";
-            Statement::Move {
-                linear,
-                to,
-                acceleration: value(0, "a", if linear { 1.2 } else { 1.4 })?,
-                speed: value(1, "v", if linear { 0.25 } else { 1.05 })?,
+            let acceleration = value(0, "a", if linear { 1.2 } else { 1.4 })?;
+            let speed = value(1, "v", if linear { 0.25 } else { 1.05 })?;
+            match (is_pose, linear) {
+                (true, _) => Statement::Move {
+                    linear,
+                    to,
+                    acceleration,
+                    speed,
+                },
+                (false, false) => Statement::Turn {
+                    to,
+                    acceleration,
+                    speed,
+                },
+                // Without kinematics, the pose of the tool is unknown.
+                (false, true) => return None,
             }
         }
         "stopl" | "stopj" => {
@@ -136,7 +158,7 @@ mod tests {
     fn a_program_is_taken_when_it_is_whole() {
         let mut text = "def x():\n  movel(p[0.1,0,0,0,0,0], a=2, v=0.5)".to_owned();
         assert!(programs(&mut text).is_empty());
-        text.push_str("\n\n  write_output_integer_register(25, -3) # done\nend\nstopl(2.0)\nmovej(p[0,0,0,0,0,0], 1, 2)\n");
+        text.push_str("\n\n  write_output_integer_register(25, -3) # done\nend\nstopl(2.0)\nmovej(p[0,0,0,0,0,0], 1, 2)\nmovej([0,1,0,0,0,-1.5], a=3, v=2)\n");
         let expected = [
             Ok(vec![
                 Statement::Move {
@@ -157,6 +179,11 @@ mod tests {
                 acceleration: 1.0,
                 speed: 2.0,
             }]),
+            Ok(vec![Statement::Turn {
+                to: [0.0, 1.0, 0.0, 0.0, 0.0, -1.5],
+                acceleration: 3.0,
+                speed: 2.0,
+            }]),
         ];
         assert_eq!(programs(&mut text), expected);
         assert_eq!(text, "");
@@ -168,6 +195,8 @@ mod tests {
             "movel(p[0,0,0,0,0], a=1)",
             "movel(p[0,0,0,0,0,nan], a=1)",
             "movej(p[0,0,0,0,0,0], v=0)",
+            "movej([0,0,0,0,0])",
+            "movel([0,0,0,0,0,0])",
             "write_output_integer_register(48, 1)",
             "servoj(1)",
             "stopl()",

@@ -1,8 +1,9 @@
 //! Simulates a robot, behind the two interfaces that drivers use.
 //!
-//! The robot has no joints: the tool moves straight to each pose with the given speed and
-//! acceleration, and reported joint values do not change. Programs consist of a few statements:
-//! movel, movej (to a pose), stopl, stopj, sleep, write_output_integer_register.
+//! The robot has no kinematics: the tool moves straight to each pose with the given speed and
+//! acceleration, and the joints turn independently of it. Programs consist of a few statements:
+//! movel to a pose, movej to a pose or to joint positions, stopl, stopj, sleep,
+//! write_output_integer_register.
 
 mod motion;
 mod served;
@@ -52,6 +53,8 @@ struct Robot {
     switched_on: Instant,
     seen: Instant,
     pose: [f64; 6],
+    /// Positions of the joints, rad.
+    joints: [f64; 6],
     program: Option<Running>,
     registers: [i32; 48],
     slider: f64,
@@ -75,6 +78,7 @@ impl Simulator {
         let now = Instant::now();
         let robot = Robot {
             pose: settings.home,
+            joints: [0.0; 6],
             settings,
             switched_on: now,
             seen: now,
@@ -185,7 +189,10 @@ impl Robot {
                 let step = left.min(STEP);
                 let ended = motion.step(step);
                 left -= step;
-                self.pose = motion.pose();
+                match motion.joints() {
+                    Some(joints) => self.joints = joints,
+                    None => self.pose = motion.pose(),
+                }
                 if ended {
                     program.motion = None;
                 } else if left <= 0.0 {
@@ -217,6 +224,14 @@ impl Robot {
                 if let Some(register) = self.registers.get_mut(number) {
                     *register = value;
                 }
+            }
+            Some(Statement::Turn {
+                to,
+                acceleration,
+                speed,
+            }) => {
+                let motion = Motion::of_joints(self.joints, to, speed, acceleration);
+                program.motion = Some(motion);
             }
             Some(Statement::Move {
                 linear,

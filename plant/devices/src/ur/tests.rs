@@ -29,6 +29,10 @@ fn to(target: [f64; 6]) -> Vec<(String, skills::Value)> {
     vec![("TargetPosition".to_owned(), target.into())]
 }
 
+fn turned(target: [f64; 6]) -> Vec<(String, skills::Value)> {
+    vec![("TargetJointPosition".to_owned(), target.into())]
+}
+
 impl Bench {
     fn settings(&self) -> Settings {
         Settings {
@@ -57,12 +61,16 @@ async fn its_drivers_are_as_drivers_should_be() {
         "PtpMoveSkillType",
         "LinearMoveSkillType",
         "ForceMoveSkillType",
+        "JointPtpMoveSkillType",
     ] {
         let bench = bench().await;
         let mut corners = [[-0.4, 0.3, 0.2], [0.4, 0.3, -0.2], [0.1, -0.5, 0.4]];
         let around = || {
             corners.rotate_left(1);
             let [x, y, z] = corners[0];
+            if of == "JointPtpMoveSkillType" {
+                return turned([x * 5.0, y * 5.0, z * 5.0, 0.0, x, 0.0]);
+            }
             let mut parameters = to([x, y, z, 0.0, x, 0.0]);
             if of == "ForceMoveSkillType" {
                 parameters.push(("MaxForce".to_owned(), vec![0.0, 0.0, 30.0].into()));
@@ -90,6 +98,29 @@ async fn its_tool_arrives_where_it_was_told_to_be() {
             .all(|(is, wanted)| (is - wanted).abs() < 1e-5),
         "{position:?}"
     );
+}
+
+#[tokio::test]
+async fn its_joints_arrive_and_turn_by_a_full_turn_at_most() {
+    let bench = bench().await;
+    let driver = || bench.driver("JointPtpMoveSkillType");
+    let target = [0.5, -1.5, 1.0, 0.0, 6.28, -0.25];
+    let of = "JointPtpMoveSkillType";
+    let outcome = conformance::run_once(of, driver(), turned(target))
+        .await
+        .unwrap();
+    assert!(outcome.succeeded, "{}", outcome.message);
+    let (name, joints) = &outcome.results[0];
+    assert_eq!(name, "JointPosition");
+    let joints = joints.as_f64s().unwrap();
+    let mut pairs = joints.iter().zip(target);
+    assert!(
+        pairs.all(|(is, wanted)| (is - wanted).abs() < 1e-5),
+        "{joints:?}"
+    );
+    let far = turned([0.0, 0.0, 0.0, 0.0, 0.0, 6.3]);
+    let refused = conformance::run_once(of, driver(), far).await.unwrap_err();
+    assert!(refused.to_string().contains("6.3 rad"), "{refused}");
 }
 
 #[tokio::test]

@@ -40,6 +40,11 @@ impl Drivers {
         }
     }
 
+    /// Replaces the objects of the cell for the drivers that are made later.
+    pub(crate) fn set_world(&mut self, world: World) {
+        self.world = world;
+    }
+
     /// Returns whether the component has a tool changer.
     #[must_use]
     pub fn has_tool_changer(&self) -> bool {

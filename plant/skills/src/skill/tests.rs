@@ -769,3 +769,38 @@ async fn a_run_that_takes_too_long_elsewhere_ends_with_its_work() {
         "{outcome:?}"
     );
 }
+
+#[tokio::test]
+async fn a_replaced_driver_does_the_next_run_and_not_the_run_in_progress() {
+    let bench = bench(How::WhenLet);
+    bench.run_to(State::Running).await;
+    let limit = Duration::from_millis(50);
+    let gate = Arc::new(Semaphore::new(0));
+    let next = Arc::new(Scripted {
+        how: How::Elsewhere(Elsewhere::Cancels),
+        gate: Arc::clone(&gate),
+        began: AtomicU32::new(0),
+    });
+    bench.skill.replace(next.clone(), Some(limit));
+    bench.call(Method::Suspend).await.unwrap();
+    bench.call(Method::Resume).await.unwrap();
+    bench.gate.add_permits(1);
+    let first = bench.until(State::Ready).await;
+    assert!(
+        first
+            .outcome
+            .as_ref()
+            .is_some_and(|outcome| outcome.succeeded)
+    );
+    assert_eq!(next.began.load(Ordering::SeqCst), 0);
+
+    bench.call(Method::Start).await.unwrap();
+    let refused = bench.call(Method::Suspend).await.unwrap_err();
+    assert_eq!(refused.code, Code::NotSupported, "{refused}");
+    gate.add_permits(1);
+    let second = bench.until(State::Halted).await;
+    let outcome = second.outcome.clone().unwrap();
+    assert!(outcome.message.contains("within 50ms"), "{outcome:?}");
+    let began = [&bench.driver, &next].map(|driver| driver.began.load(Ordering::SeqCst));
+    assert_eq!(began, [1, 1]);
+}

@@ -33,6 +33,50 @@ pub struct Node {
     pub kind: Kind,
 }
 
+impl Node {
+    /// Returns whether two nodes have the same content, regardless of their locations and of the
+    /// order of keys.
+    #[must_use]
+    pub fn has_same_content(&self, other: &Self) -> bool {
+        match (&self.kind, &other.kind) {
+            (Kind::Null, Kind::Null) => true,
+            (Kind::Scalar(one), Kind::Scalar(other)) => one == other,
+            (Kind::List(ones), Kind::List(others)) => {
+                let mut pairs = ones.iter().zip(others);
+                ones.len() == others.len() && pairs.all(|(one, other)| one.has_same_content(other))
+            }
+            (Kind::Map(ones), Kind::Map(others)) => {
+                let has = |(key, value): &(Self, Self)| {
+                    others.iter().any(|(other, with)| {
+                        key.has_same_content(other) && value.has_same_content(with)
+                    })
+                };
+                ones.len() == others.len() && ones.iter().all(has)
+            }
+            (Kind::Null | Kind::Scalar(_) | Kind::List(_) | Kind::Map(_), _) => false,
+        }
+    }
+
+    /// Returns the value of a key; `None` without the key, and for other nodes than maps.
+    #[must_use]
+    pub fn get(&self, key: &str) -> Option<&Self> {
+        let Kind::Map(pairs) = &self.kind else {
+            return None;
+        };
+        let found = pairs.iter().find(|(name, _)| name.text() == Some(key));
+        found.map(|(_, value)| value)
+    }
+
+    /// Returns the text of a scalar.
+    #[must_use]
+    pub fn text(&self) -> Option<&str> {
+        if let Kind::Scalar(text) = &self.kind {
+            return Some(text);
+        }
+        None
+    }
+}
+
 /// The content of a node.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Kind {

@@ -39,12 +39,12 @@ pub(super) type Stamps = BTreeMap<PathBuf, Option<Stamp>>;
 pub(super) struct Stamp {
     device: u64,
     inode: u64,
-    len: u64,
+    pub(super) len: u64,
     modified: (i64, i64),
     changed: (i64, i64),
 }
 
-fn stamp(file: &Path) -> Option<Stamp> {
+pub(super) fn stamp(file: &Path) -> Option<Stamp> {
     let found = std::fs::metadata(file).ok()?;
     Some(Stamp {
         device: found.dev(),

@@ -1,6 +1,8 @@
-//! A motion of the tool: it accelerates, keeps its speed and decelerates, along a straight line.
+//! A motion of the tool along a straight line, or of the joints: it accelerates, keeps its speed and
+//! decelerates.
 
 use super::tidy;
+use crate::ur::REACH;
 use crate::ur::pose::{Quaternion, angle, between, of_vector, to_vector};
 
 #[derive(Debug, Clone)]
@@ -8,7 +10,10 @@ pub(super) struct Motion {
     from: [f64; 6],
     to: [f64; 6],
     turn: (Quaternion, Quaternion),
-    /// Length of the path: of the tool in m, or of its rotation in rad if that is larger.
+    /// Whether the coordinates are positions of the joints.
+    is_of_joints: bool,
+    /// Length of the path: of the tool in m, or of its rotation in rad if that is larger; of the
+    /// joint that turns most in rad.
     length: f64,
     done: f64,
     speed: f64,
@@ -27,6 +32,7 @@ impl Motion {
             from,
             to: tidy(to),
             turn,
+            is_of_joints: false,
             length: way.max(angle(turn.0, turn.1)),
             done: 0.0,
             speed: 0.0,
@@ -34,6 +40,28 @@ impl Motion {
             acceleration,
             stops: false,
         }
+    }
+
+    /// Creates a motion of the joints, which start and end together.
+    pub(super) fn of_joints(from: [f64; 6], to: [f64; 6], most: f64, acceleration: f64) -> Self {
+        let ways = from.iter().zip(to).map(|(from, to)| (to - from).abs());
+        Self {
+            to,
+            is_of_joints: true,
+            length: ways.fold(0.0, f64::max),
+            ..Self::new(from, to, most, acceleration)
+        }
+    }
+
+    /// Returns the positions of the joints; `None` for a motion of the tool.
+    pub(super) fn joints(&self) -> Option<[f64; 6]> {
+        let share = self.share();
+        let mut at = self.from;
+        for (at, to) in at.iter_mut().zip(self.to) {
+            *at += (to - *at) * share;
+        }
+        let at = if share >= 1.0 { self.to } else { at };
+        self.is_of_joints.then_some(at)
     }
 
     /// Returns the same motion, braking from now on.
@@ -87,6 +115,10 @@ impl Motion {
 
     /// Returns the velocity of the tool, m/s, without rotation.
     pub(super) fn velocity(&self) -> [f64; 6] {
+        if self.is_of_joints {
+            // A joint that turns by v moves the tool by v times the reach.
+            return [self.speed * REACH, 0.0, 0.0, 0.0, 0.0, 0.0];
+        }
         if self.length <= 0.0 {
             return [0.0; 6];
         }

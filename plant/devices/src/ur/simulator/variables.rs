@@ -89,6 +89,7 @@ impl Robot {
         match name {
             "timestamp" => Value::F64(self.seen.duration_since(self.switched_on).as_secs_f64()),
             "actual_TCP_pose" | "target_TCP_pose" => Value::Vector(self.pose),
+            "actual_q" | "target_q" => Value::Vector(self.joints),
             "actual_TCP_speed" | "target_TCP_speed" => Value::Vector(self.velocity()),
             "actual_TCP_force" => Value::Vector(self.force()),
             "robot_mode" => Value::I32(self.mode()),
