@@ -477,6 +477,7 @@ impl Speaker {
         self.result(&Outcome {
             run: 0,
             succeeded: false,
+            unknown: false,
             message: String::new(),
             results: Vec::new(),
             trace: Vec::new(),

@@ -87,7 +87,7 @@ pub(crate) async fn execute(
     .await;
     let ended = match ended {
         Err(why) if log.run().is_unknown() => {
-            let why = match is_unknown(&why) {
+            let why = match why.contains("unknown") {
                 true => why,
                 false => format!("{why}; the outcome is unknown"),
             };
@@ -584,7 +584,7 @@ impl Runs for Watched {
             Ok(outcome) if outcome.succeeded => {
                 self.ends(How::Done, None, recorded(&outcome.results));
             }
-            Ok(outcome) if is_unknown(&outcome.message) => self.unknown(&outcome.message),
+            Ok(outcome) if outcome.unknown => self.unknown(&outcome.message),
             Ok(_) if self.is_halted.load(Ordering::Relaxed) => {
                 self.ends(How::Stopped, None, Values::new());
             }
@@ -614,21 +614,6 @@ impl Runs for Watched {
         self.fell(true, &why);
         why
     }
-}
-
-/// Returns whether a message of a skill says that the end of its run is unknown. The outcome of a
-/// skill has no other place for it.
-fn is_unknown(message: &str) -> bool {
-    let message = message.to_lowercase();
-    [
-        "is unknown",
-        "is not known",
-        "is lost: ",
-        "may go on",
-        "needs a reset",
-    ]
-    .iter()
-    .any(|said| message.contains(said))
 }
 
 /// Returns whether a run may go on after a fault. `is_late` tells that the time of the run was

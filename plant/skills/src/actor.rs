@@ -657,6 +657,7 @@ impl Actor {
         let outcome = Outcome {
             run: run.number(),
             succeeded: result.is_ok(),
+            unknown: result.is_err() && self.now.needs_reset,
             message: if result.is_ok() {
                 String::new()
             } else {
@@ -690,6 +691,7 @@ impl Actor {
         let outcome = Outcome {
             run: run.number(),
             succeeded: false,
+            unknown: self.now.needs_reset,
             message,
             results: Vec::new(),
             trace: std::mem::take(&mut self.trace),

@@ -169,6 +169,7 @@ mod tests {
             Ok(Outcome {
                 run,
                 succeeded: self.way == Way::Done,
+                unknown: false,
                 message: String::new(),
                 results: Vec::new(),
                 trace: Vec::new(),

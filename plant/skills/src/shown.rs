@@ -46,6 +46,8 @@ pub struct Outcome {
     pub run: u32,
     /// Whether the work was done.
     pub succeeded: bool,
+    /// Whether the end of the work is unknown: its machine may move, and the skill needs a Reset.
+    pub unknown: bool,
     /// The reason of a failure, or a message.
     pub message: String,
     /// The results, in the order of the type; empty after a failure.

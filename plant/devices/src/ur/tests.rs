@@ -278,8 +278,7 @@ impl Driver for Brakes {
     async fn run(&self, work: Work) -> Result<Results, String> {
         let motion = Motion {
             settings: Arc::clone(&self.settings),
-            linear: true,
-            guarded: false,
+            kind: Kind::Linear,
         };
         let _other = Session::open(&self.settings, HERTZ).await?;
         let mut session = Session::open(&self.settings, HERTZ).await?;

@@ -238,7 +238,7 @@ impl SkillHandle {
             .call(&self.found.nodes.skill, node, vec![run.into()])
             .await
             .map_err(|error| called(&error, &format!("ReadOutcome of {}", self.name())))?;
-        let [ended, succeeded, message, names, values, trace] = outputs.as_slice() else {
+        let [ended, succeeded, message, names, values, trace, unknown] = outputs.as_slice() else {
             return Err(self.unexpected("its ReadOutcome says something else"));
         };
         if *ended != Variant::Boolean(true) {
@@ -249,6 +249,7 @@ impl SkillHandle {
         Ok(Some(Outcome {
             run,
             succeeded: *succeeded == Variant::Boolean(true),
+            unknown: *unknown == Variant::Boolean(true),
             message: text(message),
             results,
             trace: super::find::texts(from_variant(trace)),
@@ -379,8 +380,10 @@ impl SkillHandle {
             "FinalResultData/Message",
             "FinalResultData/Run",
             "FinalResultData/Trace",
+            "FinalResultData/Unknown",
+            "FinalResultData/Status",
         ];
-        let [succeeded, message, of, trace] = self.read(paths).await?;
+        let [succeeded, message, of, trace, unknown, status] = self.read(paths).await?;
         if of.as_ref().is_some_and(|of| run != 0 && number(of) != run) {
             return Err(self.unexpected(&format!("its outcome is of another run than {run}")));
         }
@@ -396,6 +399,14 @@ impl SkillHandle {
             // Without a value, the run counts as failed if the skill needs a Reset.
             _ => state == State::Ready,
         };
+        let unknown = match unknown {
+            Some(Variant::Boolean(unknown)) => unknown,
+            // Actions of ROS have the status of their goal: STATUS_UNKNOWN of action_msgs is 0.
+            _ => {
+                let is_goal = self.found.nodes.get("FinalResultData/GoalId").is_some();
+                is_goal && !succeeded && status == Some(Variant::Int32(0))
+            }
+        };
         let results = self.found.results.iter().zip(values);
         let results = results.filter_map(|(result, value)| {
             Some((result.name.clone(), result.shown(value.value.as_ref()?)?))
@@ -403,6 +414,7 @@ impl SkillHandle {
         Ok(Outcome {
             run,
             succeeded,
+            unknown,
             message: message.as_ref().map(text).unwrap_or_default(),
             results: if succeeded {
                 results.collect()

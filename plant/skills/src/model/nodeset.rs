@@ -298,6 +298,12 @@ impl Nodes {
                 Builtin::String,
                 "Its steps and what was done in them, each with the seconds since its beginning.",
             ),
+            (
+                34,
+                "1:Unknown",
+                Builtin::Boolean,
+                "Whether the end of its work is unknown: the machine may move, and the skill needs a Reset.",
+            ),
         ];
         for (offset, browse_name, builtin, about) in outcome {
             let mut node = Node::new("UAVariable", parent + offset, browse_name)

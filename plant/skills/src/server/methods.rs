@@ -87,14 +87,15 @@ fn read_outcome(skill: &Skill, request: &MethodRequest) -> Result<Vec<Variant>, 
         .outcome_of(*run)
         .map_err(|refusal| CallRefusal::from(status(&refusal)))?;
     let ended = outcome.is_some();
-    let (succeeded, message, results, trace) = match &outcome {
+    let (succeeded, message, results, trace, unknown) = match &outcome {
         Some(outcome) => (
             outcome.succeeded,
             outcome.message.as_str(),
             outcome.results.as_slice(),
             outcome.trace.as_slice(),
+            outcome.unknown,
         ),
-        None => (false, "", &[][..], &[][..]),
+        None => (false, "", &[][..], &[][..], false),
     };
     let [names, values] = to_pairs(results);
     Ok(vec![
@@ -104,6 +105,7 @@ fn read_outcome(skill: &Skill, request: &MethodRequest) -> Result<Vec<Variant>, 
         names,
         values,
         texts(trace),
+        unknown.into(),
     ])
 }
 

@@ -85,6 +85,7 @@ impl Nodes {
         values.add("FinalResultData/Succeeded", false);
         values.add("FinalResultData/Message", "");
         values.add("FinalResultData/Trace", texts(&[]));
+        values.add("FinalResultData/Unknown", false);
         values.show(server);
         self.show_defaults(server, facts);
         for method in Method::ALL {
@@ -122,6 +123,7 @@ impl Nodes {
         values.add("FinalResultData/Succeeded", outcome.succeeded);
         values.add("FinalResultData/Message", outcome.message.as_str());
         values.add("FinalResultData/Trace", texts(&outcome.trace));
+        values.add("FinalResultData/Unknown", outcome.unknown);
         values.values.extend(named(&self.results, &outcome.results));
         values.show(server);
     }

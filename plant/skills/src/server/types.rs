@@ -116,4 +116,4 @@ fn range(server: &Server, node: &NodeId) -> Option<(f64, f64)> {
 }
 
 /// The members of the results of SkillType itself.
-pub(crate) const OUTCOME: [&str; 4] = ["Run", "Succeeded", "Message", "Trace"];
+pub(crate) const OUTCOME: [&str; 5] = ["Run", "Succeeded", "Message", "Trace", "Unknown"];

@@ -734,6 +734,7 @@ async fn work_elsewhere_without_an_end_is_unknown_and_needs_a_reset() {
         assert_eq!((shown.state, shown.needs_reset), (State::Halted, true));
         let outcome = bench.skill.outcome(run).unwrap();
         assert!(outcome.message.contains("unknown"), "{outcome:?}");
+        assert!(outcome.unknown);
         let refused = bench.skill.execute(ME, Vec::new(), None).await.unwrap_err();
         assert_eq!(refused.code, Code::InvalidState, "{refused}");
         bench.call(Method::Reset).await.unwrap();

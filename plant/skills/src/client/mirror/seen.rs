@@ -313,6 +313,7 @@ impl Seen {
         let mut outcome = outcome.unwrap_or_else(|fault| Outcome {
             run,
             succeeded: false,
+            unknown: true,
             message: fault.to_string(),
             results: Vec::new(),
             trace: Vec::new(),

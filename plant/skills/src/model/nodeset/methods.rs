@@ -81,6 +81,11 @@ pub(super) const OF_A_SKILL: [Method; 2] = [
             several("Names", STRING, "Its results."),
             several("Values", BASE_DATA_TYPE, "What they are, likewise."),
             several("Trace", STRING, "Its steps."),
+            one(
+                "Unknown",
+                BOOLEAN,
+                "Whether the end of its work is unknown.",
+            ),
         ],
     },
 ];
