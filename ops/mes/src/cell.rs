@@ -466,7 +466,11 @@ fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String, Value)>, S
         }
         Ok((given.name.clone(), value))
     };
-    given.iter().map(value).collect()
+    let values: Vec<(String, Value)> = given.iter().map(value).collect::<Result<_, _>>()?;
+    if let Some(workspace) = &found.workspace {
+        workspace.allows_target(values.iter())?;
+    }
+    Ok(values)
 }
 
 /// Returns the value of a parameter in the unit of the skill.

@@ -482,6 +482,7 @@ fn component(settings: &Settings, driver: ExecuteProcess, locator: LocateObject)
         limits: plant_opcua::limits::ClientLimits::default(),
         device: None,
         robot: None,
+        workspace: None,
         power_off: false,
         world: Arc::default(),
         values: Vec::new(),

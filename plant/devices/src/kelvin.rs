@@ -15,9 +15,9 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    Builtin, COMPOSITE_HALT_TIMEOUT, Device, DeviceValue, Driver, DriverFault, Measured,
-    Parameters, PartEnd, Partner, PeerAccess, Results, Runs, SkillClient, SkillFault, ToolState,
-    TypeName, Value, Work, run_part,
+    Builtin, COMPOSITE_HALT_TIMEOUT, Chosen, Device, DeviceValue, Driver, DriverFault, Measured,
+    Needs, Parameters, PartEnd, Partner, PeerAccess, Results, Runs, SkillClient, SkillFault,
+    ToolState, TypeName, Value, Work, run_part,
 };
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
@@ -272,7 +272,8 @@ impl Changer {
         if !is_called && !self.shown.borrow().mover.is_empty() {
             return;
         }
-        if let Ok((endpoint, _)) = peers.robot(partner.as_ref()).await {
+        if let Ok(Chosen { endpoint, .. }) = peers.robot(partner.as_ref(), &Needs::default()).await
+        {
             self.change(|state| state.mover = endpoint);
         }
     }
@@ -654,8 +655,9 @@ impl Changer {
             }
             Mover::Component(partner) => partner,
         };
+        let needs = Needs::default();
         let endpoint = tokio::select! {
-            found = self.peers.robot(partner.as_ref()) => found?.0,
+            found = self.peers.robot(partner.as_ref(), &needs) => found?.endpoint,
             () = work.stopped() => return Err("stopped".to_owned()),
         };
         self.change(|state| state.mover.clone_from(&endpoint));

@@ -37,7 +37,7 @@ use plant_opcua::client::{
 };
 use plant_opcua::types::StatusCode;
 
-pub use choice::ToolState;
+pub use choice::{Chosen, Needs, ToolState};
 pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
@@ -656,6 +656,7 @@ mod tests {
         );
         let gripper = serve("parallel-gripper.yaml", &[("400 ms", "20 ms")]);
         let partners = Partners {
+            prefer: Vec::new(),
             robot: Some(Partner::At(robot.url().to_owned())),
             gripper: Some(Partner::Called("urn:example:gripper".to_owned())),
             plate: None,

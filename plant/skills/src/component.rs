@@ -32,6 +32,7 @@ use crate::configuration::Configurable;
 use crate::driver::Driver;
 use crate::grip::GripPoint;
 use crate::parameters::TypeName;
+use crate::workspace::Workspace;
 use crate::yaml::Place;
 
 /// A component, read from YAML or created by a program.
@@ -69,6 +70,8 @@ pub struct Component {
     pub power_off: bool,
     /// The objects of the cell by their ObjectIds, for composites.
     pub world: World,
+    /// The positions that its moves reach; `None` for no limits.
+    pub workspace: Option<Arc<Workspace>>,
     /// The values that it shows beside its skills.
     pub values: Vec<ValueSetup>,
     /// The fields of its configuration.
@@ -230,6 +233,8 @@ pub struct Partners {
     /// The pose of the tool plate in the frame of the flange; `None` for the tool plate of the tool
     /// changer of the robot, if there is one.
     pub plate: Option<[f64; 6]>,
+    /// The ApplicationUris of robots and grippers that are preferred, the most preferred first.
+    pub prefer: Vec<String>,
     /// Time limit of each run.
     pub within: Duration,
 }

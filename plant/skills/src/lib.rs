@@ -26,12 +26,14 @@ mod skill;
 mod value;
 mod values;
 mod variant;
+mod workspace;
 pub mod yaml;
 
 pub use authority::{Authority, Owner};
 pub use client::{
-    ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, Mirror, Mirrors,
-    PeerAccess, RemoteState, SkillClient, SkillHandle, SkillStates, ToolState, Watchable,
+    Chosen, ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, Mirror,
+    Mirrors, Needs, PeerAccess, RemoteState, SkillClient, SkillHandle, SkillStates, ToolState,
+    Watchable,
 };
 pub use component::{
     Asked, Change, ChangeKind, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers,
@@ -56,3 +58,4 @@ pub use values::{
     DeviceValue, LiveValue, Measure, Measured, Reading, Sensor, Statistics, Tally, ValueFacts,
 };
 pub use variant::{from_variant, to_variant};
+pub use workspace::{Workspace, Zone};

@@ -33,6 +33,12 @@ pub const CURRENT_TOOL: &str = "CurrentTool";
 /// The endpoint of the robot that carries the changer.
 pub const MOVER_ENDPOINT: &str = "MoveSkillControllerEndpoint";
 
+/// The largest distance from the base of a robot, m.
+pub const REACH: &str = "Reach";
+/// The names of the zones of a robot.
+pub const ZONE_NAMES: &str = "ZoneNames";
+/// The bounds of these zones.
+pub const ZONE_BOUNDS: &str = "ZoneBounds";
 /// The properties of a grasp skill with a grip point.
 pub const GRIP_POINT_OFFSET: &str = "GripPointOffset";
 /// A value of [`GripType`](crate::GripType).

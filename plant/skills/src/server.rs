@@ -45,6 +45,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior};
 
+use self::grip::Stated;
 use self::lock::Lock;
 use self::methods::status;
 pub use self::power::PowerOff;
@@ -62,6 +63,7 @@ use crate::parameters::{Parameter, TypeName};
 use crate::shown::Observer;
 use crate::skill::{Facts, Skill};
 use crate::values::LiveValue;
+use crate::workspace::Workspace;
 use crate::yaml::{Code, Finding, Findings};
 
 /// Settings of the server of a component, beside the component.
@@ -373,7 +375,8 @@ fn make_all(
     let mut findings = Findings::default();
     let mut made = Vec::new();
     for (number, setup) in (1..).zip(&component.skills) {
-        match make(server, (number, setup), folder, drivers, ids) {
+        let workspace = component.workspace.as_deref();
+        match make(server, (number, setup, workspace), folder, drivers, ids) {
             Ok(skill) => made.push(skill),
             Err(finding) => findings.push(finding),
         }
@@ -406,7 +409,7 @@ fn help_for_type(skill_type: &TypeName) -> String {
 /// Creates the instance of a skill's type, and its description.
 fn make(
     server: &Server,
-    (number, setup): (u32, &SkillSetup),
+    (number, setup, workspace): (u32, &SkillSetup, Option<&Workspace>),
     folder: &NodeId,
     drivers: &mut Drivers,
     free: &mut IdRange,
@@ -434,12 +437,17 @@ fn make(
         .map_err(|fault| wrong(Code::Driver, fault.to_string()))?;
     let changes_tools =
         drivers.has_tool_changer() && types.contains(&TypeName::own("ToolSkillType"));
+    let stated = Stated {
+        grip: setup.grip_point.as_ref(),
+        workspace: workspace.filter(|_| types.contains(&TypeName::own("MotionSkillType"))),
+    };
     let first = number * IDS_PER_SKILL;
     let of_tools = changes_tools.then_some(tool::PROPERTIES).into_iter();
     let of_tools = of_tools.flatten().chain(["ProgramDiagnostic"]);
     let spec = InstanceSpec {
         event_notifier: true,
-        optional: grip::properties(setup.grip_point.as_ref())
+        optional: stated
+            .properties()
             .chain(of_tools.map(str::to_owned))
             .collect(),
         ..InstanceSpec::new(
@@ -462,9 +470,7 @@ fn make(
         let finding = wrong(code, format!("{skill_type} has no instances: {error}"));
         finding.with_help("a subtype that is not abstract has skills")
     })?;
-    if let Some(grip) = &setup.grip_point
-        && !grip::show(server, &instance, grip)
-    {
+    if !stated.show(server, &instance) {
         let message =
             format!("`grip_point` is for skills of GraspSkillType, and this is {skill_type}");
         return Err(wrong(Code::SkillType, message));

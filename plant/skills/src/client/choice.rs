@@ -14,6 +14,7 @@ use crate::parameters::TypeName;
 use crate::runs::Runs as _;
 use crate::shown::Outcome;
 use crate::value::Value;
+use crate::workspace::Workspace;
 
 /// The state of a tool changer, as its component shows it.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -27,10 +28,56 @@ pub struct ToolState {
 }
 
 /// A component that can do a part of the work.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 struct Candidate {
     endpoint: String,
     application_uri: String,
+    /// The workspaces of its moves.
+    workspaces: Vec<Workspace>,
+}
+
+/// A component that was chosen, and the reasons for and against the candidates.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Chosen {
+    /// The endpoint.
+    pub endpoint: String,
+    /// The reason, for the trace.
+    pub reason: String,
+    /// The other candidates, each with the reason why it was not chosen.
+    pub others: Vec<String>,
+}
+
+/// The requirements of a run for its robot.
+#[derive(Debug, Clone, Default)]
+pub struct Needs<'a> {
+    /// The positions that the robot has to reach, m.
+    pub positions: &'a [[f64; 3]],
+    /// The preferred ApplicationUris, the most preferred first.
+    pub prefer: &'a [String],
+}
+
+impl Candidate {
+    /// Returns the reason why the component cannot do the work, if any.
+    fn reaches(&self, positions: &[[f64; 3]]) -> Result<(), String> {
+        let workspaces = self.workspaces.iter();
+        let mut all = workspaces.flat_map(|of| positions.iter().map(|at| of.allows(*at)));
+        all.find(Result::is_err).unwrap_or(Ok(()))
+    }
+}
+
+/// Returns the only candidate, or the most preferred, with its reason. `None` if several are equal.
+fn preferred<'c>(
+    fitting: &[&'c Candidate],
+    prefer: &[String],
+    only: &str,
+) -> Option<(&'c Candidate, String)> {
+    if let [one] = fitting {
+        return Some((one, only.to_owned()));
+    }
+    prefer.iter().find_map(|uri| {
+        let found = fitting.iter().find(|one| one.application_uri == *uri);
+        found.map(|one| (*one, "preferred".to_owned()))
+    })
 }
 
 /// The tool of a pick and place.
@@ -54,45 +101,87 @@ impl PeerAccess {
         detector.ok_or_else(|| "discovery is not running".to_owned())
     }
 
-    /// Returns the endpoint of the robot, and why it was chosen.
+    /// Chooses the robot. A given robot counts. Otherwise the robot reaches the positions, and of
+    /// several such robots it has a tool at its changer or is the most preferred.
     ///
     /// # Errors
-    /// There is no robot, or several are found.
-    pub async fn robot(&self, given: Option<&Partner>) -> Result<(String, String), String> {
+    /// There is no robot, or several are equal; with the reason for each candidate.
+    pub async fn robot(
+        &self,
+        given: Option<&Partner>,
+        needs: &Needs<'_>,
+    ) -> Result<Chosen, String> {
+        let wrong = |why: String| format!("MoveSkillControllerEndpoint: {why}");
         if let Some(partner) = given {
             let endpoint = self.endpoint(partner).await?;
-            return Ok((endpoint, "named".to_owned()));
+            let known = self.detector.as_ref().map(Detector::all);
+            let robots = having(&known.unwrap_or_default(), &[]);
+            if let Some(robot) = robots.iter().find(|one| is_at(one, &endpoint)) {
+                let reached = robot.reaches(needs.positions);
+                reached.map_err(|why| wrong(format!("{}: {why}", robot.application_uri)))?;
+            }
+            return Ok(Chosen {
+                endpoint,
+                reason: "named".to_owned(),
+                others: Vec::new(),
+            });
         }
-        let wrong = |why: String| format!("MoveSkillControllerEndpoint: {why}");
         let detector = self.searching().map_err(&wrong)?;
         let moves = ["PtpMoveSkillType", "LinearMoveSkillType"];
         let robots = candidates(detector, &moves).await;
-        match robots.as_slice() {
-            [] => Err(wrong(format!(
+        if robots.is_empty() {
+            return Err(wrong(format!(
                 "no robot with {} is found{}",
                 moves.join(" and "),
                 detector.unreadable()
-            ))),
-            [one] => Ok((one.endpoint.clone(), "the only robot".to_owned())),
-            several => {
-                let mut carrying = Vec::new();
-                for (_, state) in self.changers(detector).await {
-                    let has_tool = state.current.as_ref().is_some_and(|tool| !tool.is_empty());
-                    let robot = several.iter().find(|one| is_at(one, &state.mover));
-                    carrying.extend(robot.filter(|_| has_tool));
-                }
-                match carrying.as_slice() {
-                    [one] => Ok((
-                        one.endpoint.clone(),
-                        "the only robot with a tool".to_owned(),
-                    )),
-                    _ => Err(wrong(format!(
-                        "several robots are found, give one of {}",
-                        list(several)
-                    ))),
-                }
+            )));
+        }
+        let mut fitting = Vec::new();
+        let mut others = Vec::new();
+        for robot in &robots {
+            match robot.reaches(needs.positions) {
+                Ok(()) => fitting.push(robot),
+                Err(why) => others.push(format!("{}: {why}", robot.application_uri)),
             }
         }
+        if fitting.is_empty() {
+            let why = format!("no robot reaches the positions: {}", others.join("; "));
+            return Err(wrong(why));
+        }
+        let only = match others.is_empty() {
+            true => "the only robot",
+            false => "the only robot that reaches the positions",
+        };
+        let mut chosen = preferred(&fitting, &[], only);
+        if chosen.is_none() {
+            let mut carrying = Vec::new();
+            for (_, state) in self.changers(detector).await {
+                let has_tool = state.current.as_ref().is_some_and(|tool| !tool.is_empty());
+                let robot = fitting.iter().find(|one| is_at(one, &state.mover));
+                carrying.extend(robot.filter(|_| has_tool).copied());
+            }
+            chosen = preferred(&carrying, needs.prefer, "the only robot with a tool")
+                .or_else(|| preferred(&fitting, needs.prefer, ""));
+        }
+        let Some((robot, reason)) = chosen else {
+            let list = list(&fitting);
+            return Err(wrong(format!(
+                "several robots are found, give one of {list}"
+            )));
+        };
+        let passed = fitting.iter().filter(|one| one.endpoint != robot.endpoint);
+        others.extend(passed.map(|one| {
+            let why = match reason.as_str() {
+                "preferred" => "less preferred",
+                _ => "it has no tool",
+            };
+            format!("{}: {why}", one.application_uri)
+        }));
+        Ok(Chosen {
+            endpoint: robot.endpoint.clone(),
+            reason,
+            others,
+        })
     }
 
     /// Returns the tool at the flange of a robot.
@@ -100,6 +189,7 @@ impl PeerAccess {
         &self,
         given: Option<&Partner>,
         mover: &str,
+        prefer: &[String],
     ) -> Result<ChosenTool, String> {
         let wrong = |why: String| format!("ToolSkillControllerEndpoint: {why}");
         let Some(detector) = &self.detector else {
@@ -146,15 +236,16 @@ impl PeerAccess {
         if let Some(own) = grippers.iter().find(|one| is_at(one, mover)) {
             return Ok(at_flange(own.endpoint.clone(), "the gripper of the robot"));
         }
-        match grippers.as_slice() {
-            [] => Err(wrong(format!(
-                "no gripper is found{}",
-                detector.unreadable()
-            ))),
-            [one] => Ok(at_flange(one.endpoint.clone(), "the only gripper")),
-            several => Err(wrong(format!(
+        let all: Vec<&Candidate> = grippers.iter().collect();
+        if all.is_empty() {
+            let unreadable = detector.unreadable();
+            return Err(wrong(format!("no gripper is found{unreadable}")));
+        }
+        match preferred(&all, prefer, "the only gripper") {
+            Some((one, reason)) => Ok(at_flange(one.endpoint.clone(), &reason)),
+            None => Err(wrong(format!(
                 "several grippers are found, give one of {}",
-                list(several)
+                list(&all)
             ))),
         }
     }
@@ -277,7 +368,7 @@ fn uri_at(detector: &Detector, endpoint: &str) -> String {
     found.map(|one| one.application_uri).unwrap_or_default()
 }
 
-fn list(candidates: &[Candidate]) -> String {
+fn list(candidates: &[&Candidate]) -> String {
     let each = candidates
         .iter()
         .map(|one| format!("{} at {}", one.application_uri, one.endpoint));
@@ -316,9 +407,13 @@ fn having(all: &[Detected], types: &[&str]) -> Vec<Candidate> {
         .into_iter()
         .filter(|(_, (_, skills))| has_all(skills));
     found
-        .map(|(endpoint, (application_uri, _))| Candidate {
+        .map(|(endpoint, (application_uri, skills))| Candidate {
             endpoint: endpoint.to_owned(),
             application_uri: application_uri.to_owned(),
+            workspaces: skills
+                .iter()
+                .filter_map(|skill| skill.workspace.clone())
+                .collect(),
         })
         .collect()
 }

@@ -7,8 +7,8 @@ use std::time::Duration;
 use async_trait::async_trait;
 use tokio::sync::watch;
 
-use super::{ClientOptions, Detector, PeerAccess, Remote, SkillClient, ToolState};
-use crate::component::{Component, Device, DriverFault, DriverSetup};
+use super::{ClientOptions, Detector, Needs, PeerAccess, Remote, SkillClient, ToolState};
+use crate::component::{Component, Device, DriverFault, DriverSetup, Partner};
 use crate::conformance;
 use crate::driver::{Driver, Results, Work};
 use crate::parameters::TypeName;
@@ -286,6 +286,86 @@ async fn nothing_moves_without_the_object_a_tool_or_a_fitting_grasp() {
     }
     assert_eq!(cell.runs(), [0, 0, 0]);
     for server in cell.others {
+        server.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_other() {
+    let named = |uri: &str, more: &str| {
+        let yaml = ROBOT.replace("urn:example:robot", uri);
+        serve(&format!("{yaml}{more}\n"), None)
+    };
+    let zones = "zones: [{name: table, box: [-0.5, -0.5, 0, 0.5, 0.5, 0.5]}]";
+    let robots = [
+        named("urn:test:short", "reach: 0.3"),
+        named("urn:test:table", zones),
+        named("urn:test:far", "reach: 1.2"),
+    ];
+    let options = ClientOptions {
+        within: Duration::from_secs(10),
+        ..ClientOptions::default()
+    };
+    let detector = Detector::new(options.clone());
+    for server in &robots {
+        detector.seen(server.url(), server.url());
+    }
+    let mut changes = detector.changes();
+    let complete = async {
+        while detector.all().len() < 2 * robots.len() {
+            changes.changed().await.unwrap();
+        }
+    };
+    tokio::time::timeout(SOON, complete).await.unwrap();
+    let peers = PeerAccess {
+        options,
+        detector: Some(detector),
+    };
+    let choose = async |at: [f64; 3], prefer: &[&str], given: Option<&str>| {
+        let prefer: Vec<String> = prefer.iter().map(|uri| (*uri).to_owned()).collect();
+        let positions = [[0.2, 0.0, 0.1], at];
+        let needs = Needs {
+            positions: &positions,
+            prefer: &prefer,
+        };
+        let given = given.map(|uri| Partner::Called(uri.to_owned()));
+        peers.robot(given.as_ref(), &needs).await
+    };
+    let out_of_zone = "0.900, 0.000, 0.100 m is in none of its zones: table";
+    let too_far = "0.900, 0.000, 0.100 m is 0.906 m from its base, and it reaches 0.3 m";
+    let mut chosen = choose([0.9, 0.0, 0.1], &[], None).await.unwrap();
+    chosen.others.sort();
+    assert_eq!(chosen.endpoint, robots[2].url());
+    assert_eq!(chosen.reason, "the only robot that reaches the positions");
+    let others = [
+        format!("urn:test:short: {too_far}"),
+        format!("urn:test:table: {out_of_zone}"),
+    ];
+    assert_eq!(chosen.others, others);
+
+    let several = choose([0.4, 0.2, 0.1], &[], None).await.unwrap_err();
+    assert!(several.contains("several robots are found"), "{several}");
+    assert!(!several.contains("urn:test:short"), "{several}");
+    let prefer = ["urn:test:short", "urn:test:table"];
+    let chosen = choose([0.4, 0.2, 0.1], &prefer, None).await.unwrap();
+    assert_eq!(chosen.endpoint, robots[1].url());
+    assert_eq!(chosen.reason, "preferred");
+    let less = "urn:test:far: less preferred".to_owned();
+    assert!(chosen.others.contains(&less), "{:?}", chosen.others);
+
+    let none = choose([1.5, 0.0, 0.1], &prefer, None).await.unwrap_err();
+    assert!(none.contains("no robot reaches the positions: "), "{none}");
+    let named = choose([0.9, 0.0, 0.1], &[], Some("urn:test:short")).await;
+    assert!(named.unwrap_err().contains(too_far));
+
+    // The robot itself refuses the target, too.
+    let skill = &robots[0].skills()[0];
+    let target = Value::from([0.9, 0.0, 0.1, 0.0, 0.0, 0.0]);
+    let given = vec![("TargetPosition".to_owned(), target)];
+    let me = crate::authority::Owner::Session(1);
+    let refused = skill.execute(me, given, None).await.unwrap_err();
+    assert_eq!(refused.text, format!("TargetPosition: {too_far}"));
+    for server in robots {
         server.stop().await;
     }
 }

@@ -21,6 +21,7 @@ use crate::runs::SkillFault;
 use crate::server::OUTCOME;
 use crate::value::{Builtin, Shape, Value};
 use crate::variant::{builtin_of, from_variant};
+use crate::workspace::Workspace;
 
 /// A skill of a server.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,6 +50,8 @@ pub struct FoundSkill {
     pub tool_state: Option<ToolState>,
     /// The grip point of a grasp skill, if its component states it.
     pub grip_point: Option<GripPoint>,
+    /// The workspace of a move, if its component states it.
+    pub workspace: Option<Workspace>,
     /// Parameters and results that cannot be used, with the reasons.
     pub strange: Vec<String>,
     pub(super) nodes: Nodes,
@@ -364,6 +367,7 @@ async fn read(
         false => None,
     };
     let tool_state = tool_state(client, &nodes).await?;
+    let workspace = grip::workspace(client, &nodes).await?;
     let own = skill
         .as_u32()
         .filter(|_| client.namespaces().get(usize::from(skill.namespace)) == Some(&uri(client)));
@@ -382,6 +386,7 @@ async fn read(
         capabilities,
         tool_state,
         grip_point,
+        workspace,
         strange,
         nodes,
     })

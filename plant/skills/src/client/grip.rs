@@ -8,10 +8,13 @@ use super::find::{FoundParameter, Nodes};
 use super::lost;
 use super::packed::Packed;
 use crate::grip::{GripPoint, GripType};
-use crate::model::{GRIP_POINT_OFFSET, GRIP_POINT_OPENING, GRIP_POINT_TYPE};
+use crate::model::{
+    GRIP_POINT_OFFSET, GRIP_POINT_OPENING, GRIP_POINT_TYPE, REACH, ZONE_BOUNDS, ZONE_NAMES,
+};
 use crate::runs::SkillFault;
 use crate::value::Value;
 use crate::variant::from_variant;
+use crate::workspace::Workspace;
 
 /// Returns the grip point of a grasp skill; `above` are the objects above it, with their names.
 pub(super) async fn read(
@@ -48,6 +51,26 @@ pub(super) async fn read(
         return values(client, nodes).await.map(grip_point);
     }
     Ok(None)
+}
+
+/// Returns the workspace of a move, if its component states it.
+pub(super) async fn workspace(
+    client: &Client,
+    nodes: &Nodes,
+) -> Result<Option<Workspace>, SkillFault> {
+    let own = [REACH, ZONE_NAMES, ZONE_BOUNDS].map(|name| nodes.get(name).cloned());
+    if own.iter().all(Option::is_none) {
+        return Ok(None);
+    }
+    let [reach, names, bounds] = values(client, own).await?;
+    let reach = reach.and_then(|reach| reach.as_f64());
+    let bounds = bounds.and_then(|bounds| bounds.as_f64s());
+    let names = super::find::texts(names);
+    Ok(Some(Workspace::of(
+        reach,
+        names,
+        &bounds.unwrap_or_default(),
+    )))
 }
 
 fn grip_point([offset, grip_type, opening]: [Option<Value>; 3]) -> Option<GripPoint> {

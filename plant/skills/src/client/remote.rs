@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 
-use super::choice::fitting_grasp;
+use super::choice::{Chosen, Needs, fitting_grasp};
 use super::{PeerAccess, SkillClient, SkillHandle};
 use crate::component::{Partner, Partners, World, WorldObject};
 use crate::composite::{Job, PickAndPlace};
@@ -114,17 +114,31 @@ impl Remote {
         let object = self.object(parameters, work).await?;
         let given = named(parameters, MOVER)?;
         let given = given.or_else(|| self.partners.robot.clone());
-        let (mover, why) = self.peers.robot(given.as_ref()).await?;
-        work.note(format!("robot at {mover}: {why}")).await;
+        let place = numbers(parameters, "PlacePosition")?;
+        let positions = [object.pose, place].map(|[x, y, z, ..]| [x, y, z]);
+        let needs = Needs {
+            positions: &positions,
+            prefer: &self.partners.prefer,
+        };
+        let Chosen {
+            endpoint: mover,
+            reason,
+            others,
+        } = self.peers.robot(given.as_ref(), &needs).await?;
+        work.note(format!("robot at {mover}: {reason}")).await;
+        for other in others {
+            work.note(format!("robot not chosen: {other}")).await;
+        }
         let given = named(parameters, TOOL)?;
         let given = given.or_else(|| self.partners.gripper.clone());
-        let tool = self.peers.tool(given.as_ref(), &mover).await?;
+        let prefer = &self.partners.prefer;
+        let tool = self.peers.tool(given.as_ref(), &mover, prefer).await?;
         work.note(format!("tool at {}: {}", tool.endpoint, tool.reason))
             .await;
         let plate = self.partners.plate.map_or(tool.plate, Frame::of_pose);
         let job = Job {
             pick: object.pose,
-            place: numbers(parameters, "PlacePosition")?,
+            place,
             approach: parameters
                 .number("ApproachOffset")
                 .ok_or("ApproachOffset is not a number")?,

@@ -11,7 +11,7 @@ use plant_opcua::users::{Role, Roles};
 
 use super::configurable::read_configurable;
 use super::values::{Around, read_values};
-use super::world::{read_grip_point, read_numbers, read_world};
+use super::world::{read_grip_point, read_numbers, read_workspace, read_world};
 use super::{
     Asked, Component, DeviceKinds, DriverSetup, ExecWork, LEASE, Lds, MOST_SKILLS, NoDevices,
     Partner, Partners, Robot, Security, Simulation, SkillSetup, ValueSetup, anonymous_by_default,
@@ -59,7 +59,7 @@ impl Component {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 19] = [
+const KEYS: [&str; 21] = [
     "component",
     "application_uri",
     "namespace",
@@ -75,6 +75,8 @@ const KEYS: [&str; 19] = [
     "device",
     "robot",
     "world",
+    "reach",
+    "zones",
     "power_off",
     "values",
     "configurable",
@@ -113,6 +115,8 @@ fn component(
         device,
         robot,
         world,
+        reach,
+        zones,
         power_off,
         values,
         configurable,
@@ -150,6 +154,7 @@ fn component(
     let robot = robot.map(|node| read_robot(node, reader));
     let power_off = power_off.map_or(Some(false), |node| reader.boolean(node));
     let world = world.map_or_else(BTreeMap::new, |node| read_world(node, reader));
+    let workspace = read_workspace([reach, zones], reader);
     let around = Around {
         folder,
         kinds,
@@ -174,6 +179,7 @@ fn component(
         robot: whole(robot)?,
         power_off: power_off?,
         world: Arc::new(world),
+        workspace: workspace?.map(Arc::new),
         values: parts.values,
         configurable: parts.configurable,
         skills: parts.skills?,
@@ -590,6 +596,7 @@ fn read_driver(
             robot: None,
             gripper: None,
             plate: None,
+            prefer: Vec::new(),
             within: USUALLY_WITHIN,
         }));
     }
@@ -684,8 +691,13 @@ fn read_simulation(node: &Node, reader: &mut Reader<'_>) -> Option<Simulation> {
 }
 
 fn read_partners(node: &Node, reader: &mut Reader<'_>) -> Option<Partners> {
-    let [robot, gripper, plate, within] =
-        reader.map(node, ["robot", "gripper", "plate", "within"])?;
+    let [robot, gripper, plate, prefer, within] =
+        reader.map(node, ["robot", "gripper", "plate", "prefer", "within"])?;
+    let prefer = prefer.map(|node| reader.list(node)).unwrap_or_default();
+    let prefer: Option<Vec<String>> = prefer
+        .iter()
+        .map(|node| read_uri(node, Code::Uri, reader))
+        .collect();
     let robot = robot.map(|node| read_partner(node, reader));
     let gripper = gripper.map(|node| read_partner(node, reader));
     let plate = plate.map(|node| read_numbers(node, (-10.0, 10.0), reader));
@@ -694,6 +706,7 @@ fn read_partners(node: &Node, reader: &mut Reader<'_>) -> Option<Partners> {
         robot: whole(robot)?,
         gripper: whole(gripper)?,
         plate: whole(plate)?,
+        prefer: prefer?,
         within: within?,
     })
 }

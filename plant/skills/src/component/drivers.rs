@@ -9,6 +9,7 @@ use crate::driver::Driver;
 use crate::model::NAMESPACE;
 use crate::parameters::TypeName;
 use crate::simulated::{Arm, ArmSettings, Base, Change, Changer, Gripper, GripperSettings, Path};
+use crate::workspace::Workspace;
 
 /// Creates the drivers of a component. Its skills share a gripper, a robot, a tool changer and a
 /// base.
@@ -21,6 +22,7 @@ pub struct Drivers {
     device: Option<Arc<dyn Device>>,
     peers: PeerAccess,
     world: World,
+    workspace: Option<Arc<Workspace>>,
 }
 
 /// A driver that cannot do the work of a type.
@@ -35,6 +37,7 @@ impl Drivers {
         Self {
             device: component.device.clone(),
             world: Arc::clone(&component.world),
+            workspace: component.workspace.clone(),
             peers,
             ..Self::default()
         }
@@ -57,6 +60,18 @@ impl Drivers {
     /// # Errors
     /// The driver cannot do the work of that type.
     pub fn make(
+        &mut self,
+        setup: &DriverSetup,
+        types: &[TypeName],
+    ) -> Result<Arc<dyn Driver>, DriverFault> {
+        let driver = self.make_unbounded(setup, types)?;
+        Ok(match &self.workspace {
+            Some(workspace) => workspace.bounded(driver),
+            None => driver,
+        })
+    }
+
+    fn make_unbounded(
         &mut self,
         setup: &DriverSetup,
         types: &[TypeName],

@@ -3,8 +3,10 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use super::document::{read_name, whole};
 use crate::grip::{GripPoint, GripType, PartShape};
 use crate::parameters::shortened;
+use crate::workspace::{Workspace, Zone};
 use crate::yaml::{Code, Kind, Node, Reader};
 
 /// An object of the cell.
@@ -96,6 +98,54 @@ fn shape(
             reader.refuse(node, Code::WrongValue, message)
         }
     }
+}
+
+/// Reads the reach and the zones of a robot. `None` after an error.
+pub(super) fn read_workspace(
+    [reach, zones]: [Option<&Node>; 2],
+    reader: &mut Reader<'_>,
+) -> Option<Option<Workspace>> {
+    if reach.is_none() && zones.is_none() {
+        return Some(None);
+    }
+    let reach = reach.map(|node| reader.number(node, (0.01, 100.0)));
+    let nodes = zones.map(|node| reader.list(node)).unwrap_or_default();
+    let mut read: Vec<Zone> = Vec::new();
+    let mut is_whole = true;
+    for node in nodes {
+        let zone = read_zone(node, reader);
+        is_whole &= zone.is_some();
+        let Some(zone) = zone else { continue };
+        if read.iter().any(|known| known.name == zone.name) {
+            let message = format!("there is a zone `{}` already", shortened(&zone.name));
+            reader.refuse::<()>(node, Code::NameTwice, message);
+        }
+        read.push(zone);
+    }
+    let workspace = Workspace {
+        reach: whole(reach)?,
+        zones: read,
+    };
+    is_whole.then_some(Some(workspace))
+}
+
+fn read_zone(node: &Node, reader: &mut Reader<'_>) -> Option<Zone> {
+    let [name, bounds] = reader.map(node, ["name", "box"])?;
+    let name = reader.needed(name, "name", node.place);
+    let name = name.and_then(|node| read_name(node, reader));
+    let bounds = reader.needed(bounds, "box", node.place)?;
+    let [low_x, low_y, low_z, high_x, high_y, high_z] =
+        read_numbers(bounds, (-1000.0, 1000.0), reader)?;
+    let (low, high) = ([low_x, low_y, low_z], [high_x, high_y, high_z]);
+    if low.iter().zip(high).any(|(low, high)| *low > high) {
+        let message = "`box` is the smallest x, y, z and the largest x, y, z, in this order";
+        return reader.refuse(bounds, Code::WrongValue, message.to_owned());
+    }
+    Some(Zone {
+        name: name?,
+        low,
+        high,
+    })
 }
 
 /// Reads the grip point of a grasp skill.

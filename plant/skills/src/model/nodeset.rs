@@ -10,8 +10,8 @@ use super::table::{SkillType, Unit, Variable};
 use super::types::TYPES;
 use super::{
     CONTROLLER_TYPE, CURRENT_TOOL, EVENT_TYPE, GRIP_POINT_OFFSET, GRIP_POINT_OPENING,
-    GRIP_POINT_TYPE, MOVER_ENDPOINT, NAMESPACE, SKILL_TYPE, TOOL_PLATE_OFFSET, USED_SKILL_TYPE,
-    USES_SKILL,
+    GRIP_POINT_TYPE, MOVER_ENDPOINT, NAMESPACE, REACH, SKILL_TYPE, TOOL_PLATE_OFFSET,
+    USED_SKILL_TYPE, USES_SKILL, ZONE_BOUNDS, ZONE_NAMES,
 };
 use crate::value::{Builtin, Value};
 
@@ -483,12 +483,12 @@ struct OptionalProperty {
     offset: u32,
     name: &'static str,
     builtin: Builtin,
-    /// The number of elements of an array.
+    /// The number of elements of an array; 0 for any.
     length: Option<u32>,
     about: &'static str,
 }
 
-const OPTIONAL: [OptionalProperty; 6] = [
+const OPTIONAL: [OptionalProperty; 9] = [
     OptionalProperty {
         of: "GraspSkillType",
         offset: 94,
@@ -536,6 +536,30 @@ const OPTIONAL: [OptionalProperty; 6] = [
         builtin: Builtin::String,
         length: None,
         about: "The endpoint of the robot that carries the changer; empty until it is found.",
+    },
+    OptionalProperty {
+        of: "MotionSkillType",
+        offset: 94,
+        name: REACH,
+        builtin: Builtin::Double,
+        length: None,
+        about: "The largest distance of a target from the base of the robot, m.",
+    },
+    OptionalProperty {
+        of: "MotionSkillType",
+        offset: 95,
+        name: ZONE_NAMES,
+        builtin: Builtin::String,
+        length: Some(0),
+        about: "The zones of the robot. Targets outside of all zones are refused.",
+    },
+    OptionalProperty {
+        of: "MotionSkillType",
+        offset: 96,
+        name: ZONE_BOUNDS,
+        builtin: Builtin::Double,
+        length: Some(0),
+        about: "Six numbers for each zone: the smallest x, y, z and the largest x, y, z in the frame of the base, m.",
     },
 ];
 

@@ -1,11 +1,14 @@
-//! The grip point of a grasp skill, for clients.
+//! The grip point of a grasp skill and the workspace of a move, for clients.
 
 use plant_opcua::server::{Instance, Server};
 
 use crate::grip::GripPoint;
-use crate::model::{GRIP_POINT_OFFSET, GRIP_POINT_OPENING, GRIP_POINT_TYPE};
-use crate::value::Value;
+use crate::model::{
+    GRIP_POINT_OFFSET, GRIP_POINT_OPENING, GRIP_POINT_TYPE, REACH, ZONE_BOUNDS, ZONE_NAMES,
+};
+use crate::value::{Builtin, Value};
 use crate::variant::to_variant;
+use crate::workspace::Workspace;
 
 /// Returns the values of a grip point, by the names of their properties.
 fn values(grip: &GripPoint) -> Vec<(&'static str, Value)> {
@@ -17,16 +20,43 @@ fn values(grip: &GripPoint) -> Vec<(&'static str, Value)> {
     values
 }
 
-/// Returns the optional properties that a skill with this grip point has.
-pub(super) fn properties(grip: Option<&GripPoint>) -> impl Iterator<Item = String> {
-    let values = grip.map(values).unwrap_or_default();
-    values.into_iter().map(|(name, _)| name.to_owned())
+/// Returns the values of a workspace, by the names of their properties.
+fn bounds(workspace: &Workspace) -> Vec<(&'static str, Value)> {
+    let reach = workspace.reach.map(|reach| (REACH, Value::Double(reach)));
+    let mut values = Vec::from_iter(reach);
+    if !workspace.zones.is_empty() {
+        let names = workspace.zones.iter().map(|zone| zone.name.as_str().into());
+        values.push((ZONE_NAMES, Value::Array(Builtin::String, names.collect())));
+        values.push((ZONE_BOUNDS, Value::from(workspace.bounds())));
+    }
+    values
 }
 
-/// Shows a grip point. Returns `false` if the type of the skill has no grip points.
-pub(super) fn show(server: &Server, instance: &Instance, grip: &GripPoint) -> bool {
-    values(grip).iter().all(|(name, value)| {
-        let node = instance.node(name);
-        node.is_some_and(|node| server.show(node, to_variant(value)).is_ok())
-    })
+/// The properties of a skill that its YAML states.
+#[derive(Clone, Copy)]
+pub(super) struct Stated<'a> {
+    pub(super) grip: Option<&'a GripPoint>,
+    /// The workspace of a move.
+    pub(super) workspace: Option<&'a Workspace>,
+}
+
+impl Stated<'_> {
+    fn values(&self) -> Vec<(&'static str, Value)> {
+        let grip = self.grip.map(values).unwrap_or_default();
+        let workspace = self.workspace.map(bounds).unwrap_or_default();
+        grip.into_iter().chain(workspace).collect()
+    }
+
+    /// Returns the optional properties of the skill.
+    pub(super) fn properties(&self) -> impl Iterator<Item = String> {
+        self.values().into_iter().map(|(name, _)| name.to_owned())
+    }
+
+    /// Shows the properties. Returns `false` if the type of the skill does not have them.
+    pub(super) fn show(&self, server: &Server, instance: &Instance) -> bool {
+        self.values().iter().all(|(name, value)| {
+            let node = instance.node(name);
+            node.is_some_and(|node| server.show(node, to_variant(value)).is_ok())
+        })
+    }
 }
