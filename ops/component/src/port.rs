@@ -153,7 +153,7 @@ impl ComponentPort {
         server.start();
         let told = told_of(component, server.url(), options);
         let application = application(&told, &component.security);
-        enrol(&mut looks, (component, &told), options, server.authority());
+        enrol(&mut looks, (component, &told), options, Usage::of(&server));
         let announced = announce(told, component, options, settings.supervision);
         if server.skills().len() > MOST_IN_SPACE {
             warn!(
@@ -234,9 +234,8 @@ impl ComponentPort {
             return by_operator.into_iter().chain(by_itself).collect();
         }
         if !by_itself.is_empty() {
-            let authority = self.server.authority().clone();
             let why = format!("with {}", by_itself.join(", "));
-            let waits = tokio::spawn(restart_when_idle(authority, why));
+            let waits = tokio::spawn(restart_when_idle(Usage::of(&self.server), why));
             self.restarting = Some(AbortOnDrop(waits.abort_handle()));
         }
         Vec::new()
@@ -583,7 +582,7 @@ fn enrol(
     tasks: &mut JoinSet<()>,
     (component, announced): (&Component, &discovery::Server),
     options: &Options,
-    authority: &Authority,
+    usage: Usage,
 ) {
     let (Some(root), Some(gds)) = (&options.pki, &options.gds) else {
         return;
@@ -593,23 +592,47 @@ fn enrol(
     let urls = endpoint.zip(port.ok()).map(|(url, port)| url.urls(port));
     let applicant = announced.applicant(urls.unwrap_or_default());
     let enrolment = Enrolment::new(root, applicant, gds.clone());
-    let authority = authority.clone();
     tasks.spawn(async move {
         enrolment
             .keep(|| {
                 let why = "with its new certificate".to_owned();
-                drop(tokio::spawn(restart_when_idle(authority.clone(), why)));
+                drop(tokio::spawn(restart_when_idle(usage.clone(), why)));
             })
             .await;
     });
 }
 
-/// Restarts the program when no skill runs and no client holds the lease, because a restart must
-/// not stop a machine or part a composite. No run starts after that.
-async fn restart_when_idle(authority: Authority, why: String) {
-    if !authority.reserve() {
-        info!("the program restarts {why} when no skill runs and no client holds the lease");
-        while !authority.reserve() {
+/// The use of the component by clients.
+#[derive(Clone)]
+struct Usage {
+    skills: Vec<Skill>,
+    authority: Authority,
+}
+
+impl Usage {
+    fn of(server: &ComponentServer) -> Self {
+        Self {
+            skills: server.skills().to_vec(),
+            authority: server.authority().clone(),
+        }
+    }
+
+    /// Reserves the component for its restart, if it is idle. The restart would forget that the
+    /// outcome of a run is unknown, so such a skill is reset first.
+    fn reserve(&self) -> bool {
+        let mut skills = self.skills.iter();
+        !skills.any(|skill| skill.shown().needs_reset) && self.authority.reserve()
+    }
+}
+
+/// Restarts the program when no skill runs or needs a Reset and no client holds the lease, because
+/// a restart must not stop a machine or part a composite. No run starts after that.
+async fn restart_when_idle(usage: Usage, why: String) {
+    if !usage.reserve() {
+        info!(
+            "the program restarts {why} when no skill runs or needs a Reset and no client holds the lease"
+        );
+        while !usage.reserve() {
             tokio::time::sleep(IDLE_LOOK).await;
         }
     }
