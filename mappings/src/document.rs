@@ -195,13 +195,16 @@ document! {
         nodesets: Vec<At<String>>,
     }
 
-    /// Limits of the history that the server keeps in memory.
+    /// Limits of the history that the server keeps in memory, and its file.
     struct HistoryEntry {
         /// Values of each variable without its own `history`, 0 to 65535; default 1000.
         values: u16,
         /// MiB of all of them together, 1 to 16384; default 64.
         #[schemars(range(min = 1, max = 16384))]
         megabytes: u16,
+        /// File in which ua-server stores the history and the states of alarms, so that they survive
+        /// a restart; it is created if it is missing. Without it, they are in memory only.
+        file: String,
     }
 
     /// Limits for clients of the server. Requests above a limit are refused.

@@ -466,6 +466,8 @@ pub struct Server {
     pub publisher_alarms: bool,
     /// Size of the history.
     pub history: History,
+    /// File of the history.
+    pub history_file: Option<PathBuf>,
     /// Limits for clients.
     pub limits: ServerLimits,
     /// Rule for the servers with skills that it represents when they are found, if any.
@@ -518,6 +520,7 @@ impl Default for Server {
             bad_after: None,
             publisher_alarms: false,
             history: History::default(),
+            history_file: None,
             limits: ServerLimits::default(),
             find_skills: None,
             nodesets: Vec::new(),

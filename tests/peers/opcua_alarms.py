@@ -9,10 +9,12 @@ refreshes that subscription. The status of each call is a JSON line.
 import argparse
 import asyncio
 import base64
+import datetime
 import json
 import sys
 
 from asyncua import ua
+from asyncua.common.events import Event, get_filter_from_event_type
 
 import lifetime
 import opcua_session
@@ -52,11 +54,11 @@ def plain(value):
 
 
 class Watch:
-    def event_notification(self, event):
+    def event_notification(self, event, fields=None):
         values = vars(event)
         condition = getattr(event, "NodeId", None)
         line = {"type": event.EventType.to_string(), "source": event.SourceNode.to_string()}
-        fields = FIELDS if condition else AUDIT
+        fields = fields or (FIELDS if condition else AUDIT)
         for name, field in fields.items():
             value = values.get(field)
             line[name] = plain(value)
@@ -89,14 +91,45 @@ async def obey(client, subscription, item, line):
         await call(client, ua.NodeId.from_string(line["condition"]), METHODS[line["call"]], arguments)
 
 
+async def past(client, node, kinds, count):
+    """Prints the events of the history of a node, oldest first, and the number of responses."""
+    details = ua.ReadEventDetails()
+    details.StartTime = datetime.datetime(2020, 1, 1)
+    details.EndTime = datetime.datetime(2100, 1, 1)
+    details.NumValuesPerNode = count
+    details.Filter = await get_filter_from_event_type([client.get_node(kind) for kind in kinds])
+    wanted = ua.HistoryReadValueId()
+    wanted.NodeId = ua.NodeId.from_string(node)
+    parameters = ua.HistoryReadParameters()
+    parameters.HistoryReadDetails = details
+    parameters.TimestampsToReturn = ua.TimestampsToReturn.Both
+    parameters.ReleaseContinuationPoints = False
+    parameters.NodesToRead = [wanted]
+    answers = 0
+    while answers == 0 or wanted.ContinuationPoint:
+        (result,) = await client.uaclient.history_read(parameters)
+        result.StatusCode.check()
+        answers += 1
+        for one in result.HistoryData.Events:
+            event = Event.from_event_fields(details.Filter.SelectClauses, one.EventFields)
+            Watch().event_notification(event, FIELDS)
+        wanted.ContinuationPoint = result.ContinuationPoint
+    notifier = await client.get_node(node).read_attribute(ua.AttributeIds.EventNotifier)
+    lifetime.say(answers=answers, notifier=notifier.Value.Value)
+
+
 async def main():
     parser = argparse.ArgumentParser()
     opcua_session.add_arguments(parser)
     parser.add_argument("--type", action="append", help="alarms and their limits if not given")
+    parser.add_argument("--history", type=int, help="read the history, that many events a response")
     parser.add_argument("--node", default="i=2253", help="the Server object if not given")
     args = parser.parse_args()
     lifetime.bound(args.limit)
     async with await opcua_session.client_of(args) as client:
+        if args.history is not None:
+            await past(client, args.node, args.type or ALARMS, args.history)
+            return
         subscription = await client.create_subscription(50, Watch())
         kinds = [client.get_node(kind) for kind in args.type or ALARMS]
         item = await subscription.subscribe_alarms_and_conditions(client.get_node(args.node), kinds)

@@ -534,6 +534,28 @@ row("HistoryRead", "5.11.3", "no nodes", "BadNothingToDo")(
 )
 
 
+@row("Publish", "5.14.5", "ten requests of a subscription", "10 wait")
+async def _(server):
+    made = await server.ask(
+        "CreateSubscription",
+        server.other,
+        RequestedPublishingInterval=60_000.0,
+        RequestedLifetimeCount=10_000,
+        RequestedMaxKeepAliveCount=1_000,
+        PublishingEnabled=True,
+    )
+    requests = [ua.PublishRequest() for _ in range(10)]
+    waiting = [asyncio.ensure_future(server.send(request, server.other)) for request in requests]
+    while not all(request.RequestHeader.RequestHandle for request in requests):
+        await asyncio.sleep(0)
+    # A request that is too many answers the oldest one.
+    done = await asyncio.wait(waiting, timeout=0.5)
+    count = len(waiting) - len(done[0])
+    await server.ask("DeleteSubscriptions", server.other, SubscriptionIds=[made.SubscriptionId])
+    await asyncio.gather(*waiting, return_exceptions=True)
+    return f"{count} wait"
+
+
 @row("CreateSession", "5.7.2", "timeouts", "0 is 1000, 5000 is 5000, 1e+09 is 60000")
 async def _(server):
     found = []

@@ -166,8 +166,62 @@ async def of_server(client):
     )
 
 
+class First:
+    """Stores the first value of a monitored item."""
+
+    def __init__(self):
+        self.value = asyncio.get_running_loop().create_future()
+
+    def datachange_notification(self, node, value, data):
+        if not self.value.done():
+            self.value.set_result(value)
+
+
+async def of_roles(client, nodes):
+    """Prints the profiles and roles of the server, and the permissions of nodes."""
+    ids = ua.ObjectIds
+    profiles = client.get_node(ua.NodeId(ids.Server_ServerCapabilities_ServerProfileArray))
+    first = First()
+    subscription = await client.create_subscription(50, first)
+    await subscription.subscribe_data_change(profiles)
+    rate = await client.get_node(
+        ua.NodeId(ids.Server_ServerCapabilities_MinSupportedSampleRate)
+    ).read_data_value()
+    roles = {}
+    for role in await client.get_node(ua.NodeId(ids.Server_ServerCapabilities_RoleSet)).get_children():
+        if await role.read_node_class() != ua.NodeClass.Object:
+            continue
+        parts = await role.get_children()
+        names = [(await part.read_browse_name()).Name for part in parts]
+        (identities,) = [part for part, name in zip(parts, names) if name == "Identities"]
+        rules = [[rule.CriteriaType.name, rule.Criteria] for rule in await identities.read_value()]
+        roles[(await role.read_browse_name()).Name] = {"parts": names, "identities": rules}
+    permissions = {}
+    for node in nodes:
+        told = permissions[node] = {}
+        for name in ("RolePermissions", "UserRolePermissions", "AccessRestrictions", "AccessLevelEx", "ArrayDimensions"):
+            read = await client.get_node(node).read_attribute(A[name], raise_on_bad_status=False)
+            value = read.Value.Value if read.Value is not None else None
+            if name.endswith("RolePermissions") and value is not None:
+                value = [[one.RoleId.Identifier, int(one.Permissions)] for one in value]
+            told[name] = value if read.StatusCode.is_good() else read.StatusCode.name
+    array = await profiles.read_data_value()
+    lifetime.say(
+        profiles=array.Value.Value,
+        monitored=await asyncio.wait_for(first.value, 10),
+        stamped=array.SourceTimestamp is not None and array.ServerTimestamp is not None,
+        rate=rate.Value.Value,
+        roles=roles,
+        permissions=permissions,
+    )
+    await subscription.delete()
+
+
 async def run(args):
     async with await opcua_session.client_of(args) as client:
+        if args.roles:
+            await of_roles(client, args.roles)
+            return
         if args.server:
             await of_server(client)
             return
@@ -182,6 +236,7 @@ def main():
     opcua_session.add_arguments(parser)
     parser.add_argument("--export", action="store_true")
     parser.add_argument("--server", action="store_true")
+    parser.add_argument("--roles", metavar="NODE", nargs="+", default=[])
     args = parser.parse_args()
     lifetime.bound(args.limit)
     asyncio.run(run(args))

@@ -5,6 +5,7 @@ mod alarms;
 mod authorities;
 mod configuration;
 mod confirm;
+mod crowd;
 mod events;
 mod folders;
 mod history;

@@ -2,6 +2,7 @@
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::ops::RangeInclusive;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use super::cell::is_uri;
@@ -277,6 +278,9 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         bad_after: duration(&entry.bad_after, findings),
         publisher_alarms: given(&entry.publisher_alarms).is_some_and(|(on, _)| *on),
         history: history(&entry.history, findings),
+        history_file: given(&entry.history)
+            .and_then(|(history, _)| given(&history.file))
+            .map(|(file, _)| PathBuf::from(file)),
         limits: limits(&entry.limits, findings),
         find_skills: None,
         nodesets: Vec::new(),

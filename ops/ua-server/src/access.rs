@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use mappings::{Mapping, Permissions as Said};
 use opcua::server::node_manager::RequestContext;
 use opcua::sync::Mutex;
-use opcua::types::{MethodId, StatusCode};
+use opcua::types::{MethodId, NodeId, StatusCode};
 use plant_opcua::certificates::application_uri;
 use plant_opcua::configuration::Configuration;
 use plant_opcua::users::{Anonymous, Permissions, Role, Roles, Rules};
@@ -105,9 +105,11 @@ pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
         ..Permissions::default()
     };
     nodes.extend(Configuration::nodes().map(|method| (method, certificates)));
+    let keys: NodeId = MethodId::PublishSubscribe_GetSecurityKeys.into();
     Rules {
         anonymous: anonymous(mapping.server().anonymous),
         nodes,
+        encrypted: Configuration::nodes().chain([keys]).collect(),
     }
 }
 

@@ -16,8 +16,10 @@ mod event;
 mod methods;
 mod nodes;
 mod page;
+mod past;
 mod publishers;
 mod report;
+mod saved;
 mod trigger;
 
 use std::collections::{BTreeMap, HashMap};
@@ -30,8 +32,12 @@ use bytes::Bytes;
 use mappings::{Alarm, AlarmTrigger, Mapping, SpaceId, TopicId, Variable};
 use opcua::nodes::Event;
 use opcua::server::ServerHandle;
+use opcua::server::node_manager::{HistoryNode, RequestContext};
 use opcua::sync::Mutex;
-use opcua::types::{AttributeId, DataValue, DateTime, NodeId, ObjectTypeId, StatusCode};
+use opcua::types::{
+    AttributeId, DataValue, DateTime, NodeId, ObjectTypeId, ReadEventDetails, StatusCode,
+};
+use plant_opcua::server::EventHistory;
 use tokio::sync::Notify;
 use tracing::info;
 use uadp::Scalar;
@@ -40,10 +46,13 @@ use self::condition::{Condition, Effect, Levels, Report, Stamp};
 use self::diagnostics::Diagnostics;
 use self::event::{ConditionEvent, Identity, Kind};
 pub(crate) use self::methods::permissions;
+pub(crate) use self::past::MOST_RETURNED as MOST_EVENTS_RETURNED;
+use self::past::PastEvents;
 use self::publishers::Publishers;
 use self::report::Reports;
 use self::trigger::{Reading, Trigger};
 use crate::address;
+use crate::history::StoredConditions;
 use crate::layout::node_id;
 use crate::nodes::SpaceManager;
 use crate::values::Shown;
@@ -64,6 +73,10 @@ pub(crate) struct Alarms {
 struct Place {
     space: Arc<SpaceManager>,
     handle: ServerHandle,
+    /// The history of the events. No other lock is taken while it is held.
+    past: Mutex<PastEvents>,
+    /// The file of the conditions. No other lock is taken while it is held.
+    stored: Mutex<StoredConditions>,
 }
 
 #[derive(Default)]
@@ -144,6 +157,24 @@ impl Entry {
         }
     }
 
+    /// Returns the text that distinguishes the alarm from other alarms of its variable; `None` for
+    /// conditions that are not stored.
+    fn alarm_text(&self) -> Option<String> {
+        let (alarm, _) = self.alarm.as_ref()?;
+        Some(format!("{alarm:?}"))
+    }
+
+    /// Continues with the condition before a restart, if it is that of the same alarm.
+    fn restore(&mut self, bytes: &[u8]) {
+        let text = self.alarm_text().unwrap_or_default();
+        if let Some(parts) = saved::decoded(bytes, &text)
+            && let Some((_, trigger)) = &mut self.alarm
+        {
+            trigger.restore(parts.state.levels);
+            self.condition.restore(parts);
+        }
+    }
+
     /// Returns the report of the levels of a value.
     fn report(&self, levels: Levels, reading: Option<&Reading>, quality: StatusCode) -> Report {
         let state = self.condition.state();
@@ -216,8 +247,17 @@ impl Place {
         if effect == Effect::Nothing {
             return;
         }
+        let stored = self.stored.lock();
+        if stored.is_kept()
+            && let Some(text) = entry.alarm_text()
+        {
+            let bytes = saved::encoded(&entry.condition, &text);
+            stored.keep(&entry.identity.node, bytes);
+        }
+        drop(stored);
         let event = ConditionEvent::new(&entry.identity, entry.condition.state());
         if effect == Effect::Reported {
+            self.past.lock().keep(event.clone());
             self.raise(&event);
         }
         let mut notifier = self.handle.subscriptions().data_notifier();
@@ -313,11 +353,27 @@ fn reading(shown: &Shown) -> (Option<Reading>, StatusCode) {
 }
 
 impl Alarms {
-    /// Sets the server of the conditions and creates the conditions of a mapping.
-    pub(crate) fn stand(&self, space: Arc<SpaceManager>, handle: &ServerHandle, mapping: &Mapping) {
+    /// Sets the server of the conditions and creates the conditions of a mapping. Conditions of the
+    /// same alarms continue as they were stored.
+    pub(crate) fn stand(
+        &self,
+        space: Arc<SpaceManager>,
+        handle: &ServerHandle,
+        mapping: &Mapping,
+        stored: StoredConditions,
+    ) {
         let handle = handle.clone();
-        drop(self.place.set(Place { space, handle }));
+        let past = Mutex::default();
+        drop(self.place.set(Place {
+            space,
+            handle,
+            past,
+            stored: Mutex::new(stored),
+        }));
         self.follow(mapping);
+        if let Some(place) = self.place.get() {
+            place.stored.lock().forget_others();
+        }
     }
 
     /// Switches to the alarms of a mapping. Unchanged conditions keep their state. Clients are
@@ -376,6 +432,8 @@ impl Alarms {
                 {
                     entry.condition = known.condition;
                     entry.alarm = known.alarm;
+                } else if let Some(bytes) = place.stored.lock().take(&node) {
+                    entry.restore(&bytes);
                 }
                 entry.is_public = place.space.inner().is_public(&entry.identity.source);
                 inner.sources.insert(topic, Source::Value(node.clone()));
@@ -603,6 +661,23 @@ impl Alarms {
             subscription.notify_event(&item, &end, &*types);
         }
         Ok(())
+    }
+}
+
+/// The history of the events of conditions.
+impl EventHistory for Alarms {
+    fn read_events(
+        &self,
+        context: &RequestContext,
+        details: &ReadEventDetails,
+        node: &mut HistoryNode,
+    ) {
+        let Some(place) = self.place.get() else {
+            node.set_status(StatusCode::BadShutdown);
+            return;
+        };
+        let types = context.type_tree.read();
+        place.past.lock().read(details, node, &*types);
     }
 }
 

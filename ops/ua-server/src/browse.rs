@@ -17,10 +17,12 @@ use opcua::server::node_manager::{
     NodeManager, NodeManagerBuilder as _, ReadNode, RequestContext, ServerContext, WriteNode,
 };
 use opcua::types::{
-    BrowseDirection, ExpandedNodeId, MonitoringMode, NodeId, ReadAtTimeDetails,
+    BrowseDirection, ExpandedNodeId, MonitoringMode, NodeId, ReadAtTimeDetails, ReadEventDetails,
     ReadProcessedDetails, ReadRawModifiedDetails, ReferenceDescription, ReferenceTypeId,
     StatusCode, TimestampsToReturn,
 };
+use plant_opcua::server::{NodeFacts, Supplement};
+use plant_opcua::users::Access;
 
 use crate::auditing;
 use crate::nodes::{SpaceManager, SpaceNodes};
@@ -29,6 +31,8 @@ use crate::nodes::{SpaceManager, SpaceNodes};
 /// the mapping.
 pub(crate) struct Ordered {
     inner: Arc<DynNodeManager>,
+    /// The attributes of permissions.
+    supplement: Supplement,
 }
 
 /// The remaining references of a browse, in reverse order.
@@ -36,11 +40,24 @@ struct Rest(Vec<ReferenceDescription>);
 
 impl Ordered {
     /// Builds the node manager of `nodes` and wraps it.
-    pub(crate) fn around(
-        nodes: impl InMemoryNodeManagerImplBuilder<Impl = SpaceNodes> + 'static,
-    ) -> impl FnOnce(ServerContext) -> Self {
+    pub(crate) fn around<N>(
+        nodes: N,
+        access: &Arc<Access>,
+    ) -> impl FnOnce(ServerContext) -> Self + use<N>
+    where
+        N: InMemoryNodeManagerImplBuilder<Impl = SpaceNodes> + 'static,
+    {
+        let supplement = Supplement::new(Vec::new(), Some(Arc::clone(access)));
         |context| Self {
             inner: Box::new(InMemoryNodeManagerBuilder::new(nodes)).build(context),
+            supplement,
+        }
+    }
+
+    /// Adds the nodes of the PubSub readers before a client sees that they are missing.
+    fn look_for_readers<'n>(&self, nodes: impl Iterator<Item = &'n NodeId>) {
+        if let Some(space) = self.space() {
+            space.inner().pubsub().look_for_readers(nodes);
         }
     }
 
@@ -169,6 +186,8 @@ impl NodeManager for Ordered {
         let Some(space) = self.space() else {
             return self.inner.browse(context, nodes_to_browse).await;
         };
+        let browsed = nodes_to_browse.iter().map(BrowseNode::node_id);
+        space.inner().pubsub().look_for_readers(browsed);
         for node in nodes_to_browse {
             if space.inner().has_order(node.node_id()) {
                 let address_space = space.address_space().read();
@@ -191,6 +210,7 @@ impl NodeManager for Ordered {
         context: &RequestContext,
         nodes: &mut [&mut BrowsePathItem],
     ) -> Result<(), StatusCode> {
+        self.look_for_readers(nodes.iter().map(|item| item.node_id()));
         let inner = &self.inner;
         inner
             .translate_browse_paths_to_node_ids(context, nodes)
@@ -204,10 +224,17 @@ impl NodeManager for Ordered {
         timestamps_to_return: TimestampsToReturn,
         nodes_to_read: &mut [&mut ReadNode],
     ) -> Result<(), StatusCode> {
+        self.look_for_readers(nodes_to_read.iter().map(|node| &node.node().node_id));
         let inner = &self.inner;
         inner
             .read(context, max_age, timestamps_to_return, nodes_to_read)
-            .await
+            .await?;
+        if let Some(space) = self.space() {
+            let facts = |node: &_| NodeFacts::find(&space.address_space().read(), node);
+            self.supplement
+                .complete(context, timestamps_to_return, nodes_to_read, facts);
+        }
+        Ok(())
     }
 
     async fn history_read_raw_modified(
@@ -271,6 +298,19 @@ impl NodeManager for Ordered {
         Ok(())
     }
 
+    async fn history_read_events(
+        &self,
+        context: &RequestContext,
+        details: &ReadEventDetails,
+        nodes: &mut [&mut HistoryNode],
+        wanted: TimestampsToReturn,
+    ) -> Result<(), StatusCode> {
+        let inner = &self.inner;
+        inner
+            .history_read_events(context, details, nodes, wanted)
+            .await
+    }
+
     async fn write(
         &self,
         context: &RequestContext,
@@ -290,6 +330,7 @@ impl NodeManager for Ordered {
         context: &RequestContext,
         items: &mut [&mut CreateMonitoredItem],
     ) -> Result<(), StatusCode> {
+        self.look_for_readers(items.iter().map(|item| &item.item_to_monitor().node_id));
         self.inner.create_monitored_items(context, items).await
     }
 
@@ -319,6 +360,7 @@ impl NodeManager for Ordered {
         context: &RequestContext,
         methods_to_call: &mut [&mut MethodCall],
     ) -> Result<(), StatusCode> {
+        self.look_for_readers(methods_to_call.iter().map(|call| call.object_id()));
         let done = self.inner.call(context, methods_to_call).await;
         auditing::called(context, (methods_to_call, done));
         done

@@ -1,8 +1,9 @@
-//! History of the values (OPC 10000-11): the last values of each variable, in memory, raw and as
-//! aggregates (OPC 10000-13).
+//! History of the values (OPC 10000-11): the last values of each variable, in memory and in a file,
+//! raw and as aggregates (OPC 10000-13).
 
 mod aggregate;
 mod past;
+mod store;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -18,6 +19,8 @@ use opcua::types::{
 
 use self::aggregate::{Aggregate, Outcome, Quality, Rules, Sample};
 pub(crate) use self::past::Past;
+pub(crate) use self::store::{Store, Stored, StoredConditions};
+use crate::alarms::MOST_EVENTS_RETURNED;
 use crate::budget::{LARGEST, SMALL};
 use crate::layout::TopicNode;
 use crate::value;
@@ -40,7 +43,7 @@ struct One {
 
 /// A value of a response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Step {
+pub(crate) enum Step {
     Value(usize),
     /// There is no value before or after that time.
     NoBound(i64),
@@ -431,7 +434,7 @@ fn rules(asked: &AggregateConfiguration) -> Rules {
 /// Returns the values of a span, without its end. The order is forward from the start, or backward
 /// if the start is missing or later than the end. With bounds there is also a value at or before
 /// the start and a value at or after the end (OPC 10000-11, 6.4.3.2).
-fn steps(
+pub(crate) fn steps(
     times: &[i64],
     (start, end): (Option<i64>, Option<i64>),
     (count, bounds): (u32, bool),
@@ -496,7 +499,7 @@ fn time(shown: &Shown) -> i64 {
 }
 
 /// Returns a time, or `None` for a null time.
-fn given(time: DateTime) -> Option<i64> {
+pub(crate) fn given(time: DateTime) -> Option<i64> {
     (time != DateTime::null()).then(|| time.ticks())
 }
 
@@ -589,6 +592,7 @@ pub(crate) fn list_aggregates(core: &mut AddressSpace) {
 /// Returns the history capabilities of the server.
 pub(crate) fn capabilities() -> Vec<(VariableId, Variant)> {
     let most = u32::try_from(MOST_VALUES).unwrap_or(u32::MAX);
+    let events = u32::try_from(MOST_EVENTS_RETURNED).unwrap_or(u32::MAX);
     vec![
         (
             VariableId::HistoryServerCapabilities_AccessHistoryDataCapability,
@@ -597,6 +601,14 @@ pub(crate) fn capabilities() -> Vec<(VariableId, Variant)> {
         (
             VariableId::HistoryServerCapabilities_MaxReturnDataValues,
             most.into(),
+        ),
+        (
+            VariableId::HistoryServerCapabilities_AccessHistoryEventsCapability,
+            true.into(),
+        ),
+        (
+            VariableId::HistoryServerCapabilities_MaxReturnEventValues,
+            events.into(),
         ),
         (
             VariableId::HistoryServerCapabilities_ServerTimestampSupported,

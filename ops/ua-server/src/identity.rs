@@ -1,13 +1,12 @@
-//! The identity of the server: its limits, its build and its namespaces (OPC 10000-5, 6.3).
+//! The identity of the server: its build and its namespaces (OPC 10000-5, 6.3).
 //!
 //! The library leaves these nodes empty, or does not have them.
 
 use opcua::nodes::{ObjectBuilder, VariableBuilder};
-use opcua::server::Limits;
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
     BuildInfo, DataTypeId, DateTime, LocalizedText, NodeId, ObjectId, ObjectTypeId, QualifiedName,
-    UAString, VariableId, VariableTypeId, Variant,
+    UAString, VariableTypeId, Variant,
 };
 
 use crate::endpoint::{APPLICATION_NAME, PRODUCT_URI};
@@ -34,50 +33,6 @@ fn built() -> DateTime {
     let nanos = since.and_then(|since| i128::try_from(since.as_nanos()).ok());
     let time = nanos.map(uadp::Timestamp::from_unix_nanos);
     time.map_or_else(DateTime::null, |time| value::date_time(time.time))
-}
-
-/// Returns the limits that clients can read in addition to the limits that the library reports.
-pub(crate) fn capabilities(limits: &Limits) -> Vec<(VariableId, Variant)> {
-    let count = |number: usize| Variant::from(u32::try_from(number).unwrap_or(u32::MAX));
-    let (sessions, each) = (limits.max_sessions, &limits.subscriptions);
-    let subscriptions = sessions.saturating_mul(each.max_subscriptions_per_session);
-    let items = subscriptions.saturating_mul(each.max_monitored_items_per_sub);
-    let locales = vec![UAString::from("en")];
-    vec![
-        (
-            VariableId::Server_ServerCapabilities_LocaleIdArray,
-            locales.into(),
-        ),
-        (
-            VariableId::Server_ServerCapabilities_MaxSessions,
-            count(sessions),
-        ),
-        (
-            VariableId::Server_ServerCapabilities_MaxSubscriptions,
-            count(subscriptions),
-        ),
-        (
-            VariableId::Server_ServerCapabilities_MaxSubscriptionsPerSession,
-            count(each.max_subscriptions_per_session),
-        ),
-        (
-            VariableId::Server_ServerCapabilities_MaxMonitoredItems,
-            count(items),
-        ),
-        (
-            VariableId::Server_ServerCapabilities_MaxMonitoredItemsPerSubscription,
-            count(each.max_monitored_items_per_sub),
-        ),
-        (
-            VariableId::Server_ServerCapabilities_MaxMonitoredItemsQueueSize,
-            count(each.max_monitored_item_queue_size),
-        ),
-        // RedundancySupport None: the server is not redundant.
-        (
-            VariableId::Server_ServerRedundancy_RedundancySupport,
-            Variant::from(0_i32),
-        ),
-    ]
 }
 
 /// Adds an object below Namespaces for each own namespace. Their nodes differ between servers, so

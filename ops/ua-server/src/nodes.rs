@@ -24,11 +24,11 @@ use opcua::server::{CreateMonitoredItem, MonitoredItemHandle, SubscriptionCache}
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
     AttributeId, DataEncoding, DataValue, DateTime, MonitoringMode, NodeId, NumericRange,
-    ReadAtTimeDetails, ReadProcessedDetails, ReadRawModifiedDetails, StatusCode,
+    ReadAtTimeDetails, ReadEventDetails, ReadProcessedDetails, ReadRawModifiedDetails, StatusCode,
     TimestampsToReturn, Variant,
 };
 use plant_opcua::nodeset::NodeSets;
-use plant_opcua::server::Caller;
+use plant_opcua::server::{Caller, EventHistory as _};
 use plant_opcua::users::{Access, Right};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use tracing::{info, warn};
@@ -43,7 +43,7 @@ use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::commanders::Commander;
 use crate::confirm::Confirms;
 use crate::folders;
-use crate::history::{Past, Room, Series};
+use crate::history::{Past, Room, Series, Store, Stored};
 use crate::identity;
 use crate::layout::{FieldNode, Layout, TopicNode};
 use crate::nodesets::Loaded;
@@ -229,6 +229,11 @@ impl SpaceNodes {
         &self.nodesets
     }
 
+    /// Returns the PubSub configuration.
+    pub(crate) fn pubsub(&self) -> &PubSub {
+        &self.exits.pubsub
+    }
+
     /// Returns the Methods that clients can call.
     pub(crate) const fn methods(&self) -> &Table {
         &self.methods
@@ -325,6 +330,16 @@ impl SpaceNodes {
         let own = variables.filter_map(|one| Some((one.topic, usize::from(one.history?))));
         let most = (usize::from(usual.values), usual.bytes);
         self.past.write().limit(most, own.collect());
+    }
+
+    /// Adds the past values of a file, and stores all further values there.
+    pub(crate) fn keep_past_in(&self, (store, stored): (Store, Vec<Stored>)) {
+        self.past.write().keep_in(store, stored);
+    }
+
+    /// Writes the remaining past values to their file.
+    pub(crate) fn close_past(&self) {
+        self.past.write().close();
     }
 
     /// Sets the size limit of written values, in bytes.
@@ -1142,6 +1157,24 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         self.answer_past(context, nodes, wanted, |series, node, room| {
             series.at_times(details, node, (wanted, room));
         })
+    }
+
+    async fn history_read_events(
+        &self,
+        context: &RequestContext,
+        details: &ReadEventDetails,
+        nodes: &mut [&mut &mut HistoryNode],
+        _wanted: TimestampsToReturn,
+    ) -> Result<(), StatusCode> {
+        self.genuine.check(context)?;
+        for node in nodes {
+            if *node.node_id() == address::alarms_folder() {
+                self.exits.alarms.read_events(context, details, node);
+            } else {
+                node.set_status(StatusCode::BadHistoryOperationUnsupported);
+            }
+        }
+        Ok(())
     }
 
     async fn call(

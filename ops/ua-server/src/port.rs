@@ -13,19 +13,21 @@ use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
 use mappings::{Anonymous, Mapping, Role, Server, SpaceId, TopicId};
 use opcua::nodes::NodeType;
-use opcua::server::address_space::AddressSpace;
+use opcua::server::address_space::{AddressSpace, EventNotifier};
 use opcua::server::authenticator::AuthManager;
 use opcua::server::node_manager::memory::InMemoryNodeManagerImplBuilder;
 use opcua::server::node_manager::{NodeManagerBuilder, ServerContext};
 use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
-use opcua::types::{NodeId, NumericRange, StatusCode, VariableId, Variant};
+use opcua::types::{NodeId, NumericRange, ObjectId, StatusCode, VariableId};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::enrolment::Invitation;
 use plant_opcua::nodeset::NodeSets;
 use plant_opcua::own;
 use plant_opcua::pki::Pki;
-use plant_opcua::server::{Security, core_of, core_with};
+use plant_opcua::server::{
+    CoreValue, EventHistory, Facets, Security, Supplement, capabilities, core_of, core_with, roles,
+};
 use plant_opcua::users::{self, Access, UserFault};
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, mpsc, oneshot};
@@ -43,8 +45,7 @@ use crate::commanders::Commanders;
 use crate::components::{Components, Happened};
 use crate::confirm::Confirms;
 use crate::endpoint;
-use crate::history;
-use crate::identity;
+use crate::history::{self, Store, Stored};
 use crate::layout::{Layout, LayoutError};
 use crate::methods::{Methods, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
@@ -150,7 +151,12 @@ impl ServerPort {
         let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
         let mdns = matches!(&setup.announce, Some(to) if to.mdns.is_some());
         let shown = (&setup.sks, &pubsub, &alarms);
-        let core = core(shown, (&certificates, mdns), described);
+        let facets = Facets {
+            is_secured: security.iter().any(|policy| *policy != Security::None),
+            has_history: layout.topics.iter().any(|topic| topic.historizing),
+            has_alarms: true,
+        };
+        let core = core(shown, (&certificates, mdns), (described, facets), &access);
         let builder = endpoint::server(described, (&setup.url, port), &security);
         let (trusts_any, limits) = (setup.trust_any_client, endpoint::clients(described.limits));
         let built = (listener, builder);
@@ -158,11 +164,13 @@ impl ServerPort {
         let (server, handle) = builder
             .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
             .with_node_manager(core)
-            .with_node_manager(Ordered::around(nodes))
+            .with_node_manager(Ordered::around(nodes, &access))
             .build()
             .map_err(configuration)?;
         let manager = manager(&handle, &layout).map_err(configuration)?;
-        show_limits(mapping, &layout, (&handle, &manager), (&pubsub, &alarms));
+        let history = history(described, &layout)?;
+        let shown = (&*pubsub, &*alarms);
+        show_limits(mapping, &layout, (&handle, &manager), (shown, history));
         let (runtime, listener) = endpoint::threads(listener)?;
         let serving = runtime.spawn(server.run_with(listener));
         endpoint::stand(&runtime, door)?;
@@ -400,6 +408,7 @@ impl Port for ServerPort {
             ),
             ("server.security", was.security != is.security),
             ("server.limits", was.limits != is.limits),
+            ("server.history.file", was.history_file != is.history_file),
         ]
         .into_iter()
         .filter(|(_, differs)| *differs)
@@ -415,6 +424,7 @@ impl Port for ServerPort {
         let moved = self.methods.take_moved(mapping);
         match Layout::within(&self.namespaces, mapping, &mut self.types) {
             Ok((layout, namespaces)) => {
+                let layout = Arc::new(layout);
                 restart.extend(namespaces);
                 self.access.set_rules(access::rules(mapping, &layout));
                 let (gone, new) = self.space.exchange(&layout);
@@ -472,6 +482,7 @@ impl Port for ServerPort {
         {
             warn!("dropped the connections that clients did not close in time");
         }
+        self.space.manager().inner().close_past();
         if let Some(runtime) = self.runtime.take() {
             runtime.shutdown_background();
         }
@@ -632,7 +643,8 @@ fn audit(access: &Access, handle: &ServerHandle) {
 fn core(
     (sks, pubsub, alarms): (&Arc<Sks>, &Arc<PubSub>, &Arc<Alarms>),
     (configuration, is_announced): (&Arc<Configuration>, bool),
-    described: &Server,
+    (described, facets): (&Server, Facets),
+    access: &Arc<Access>,
 ) -> impl NodeManagerBuilder + use<> {
     let methods = [
         sks.methods(),
@@ -641,32 +653,60 @@ fn core(
         configuration.methods(),
     ];
     let methods = methods.concat();
-    let values = [capabilities(described), Configuration::values(is_announced)].concat();
-    core_with(methods, values, prepared)
+    let values = [history::capabilities(), Configuration::values(is_announced)].concat();
+    let values = values.into_iter();
+    let mut values: Vec<(VariableId, CoreValue)> =
+        values.map(|(id, value)| (id, value.into())).collect();
+    values.extend(capabilities(&endpoint::within(described.limits), facets));
+    values.extend(roles::values(access));
+    let supplement = Supplement::new(values, Some(Arc::clone(access)));
+    let supplement = supplement.with_events(Arc::clone(alarms) as Arc<dyn EventHistory>);
+    core_with(methods, supplement, prepared)
 }
 
-/// Lists the aggregates and sets the Auditing variable of the server.
+/// Lists the aggregates and the roles, and sets the Auditing variable and the EventNotifier of the
+/// server.
 fn prepared(core: &mut AddressSpace) {
     history::list_aggregates(core);
+    roles::prepare(core);
     let auditing: NodeId = VariableId::Server_Auditing.into();
     if let Some(NodeType::Variable(variable)) = core.find_mut(&auditing) {
         // A constant of the node set takes every value.
         let _is_good = variable.set_value(&NumericRange::None, true);
     }
+    let server: NodeId = ObjectId::Server.into();
+    if let Some(NodeType::Object(server)) = core.find_mut(&server) {
+        let notifier = EventNotifier::SUBSCRIBE_TO_EVENTS | EventNotifier::HISTORY_READ;
+        server.set_event_notifier(notifier);
+    }
 }
 
-/// Sets the limits of the node manager, and shows the PubSub configuration and the conditions in
+/// Sets the limits of the node manager, restores the history, and shows the PubSub configuration and the conditions in
 /// the address space.
 fn show_limits(
-    mapping: &Mapping,
-    layout: &Layout,
+    mapping: &Arc<Mapping>,
+    layout: &Arc<Layout>,
     (handle, manager): (&ServerHandle, &Arc<SpaceManager>),
-    (pubsub, alarms): (&PubSub, &Alarms),
+    ((pubsub, alarms), history): ((&PubSub, &Alarms), Option<(Store, Vec<Stored>)>),
 ) {
     limit(manager.inner(), mapping);
+    let conditions = history.map(|(mut store, values)| {
+        let conditions = store.take_conditions();
+        manager.inner().keep_past_in((store, values));
+        conditions
+    });
     pubsub.stand(places(handle, manager));
     pubsub.show(mapping, layout);
-    alarms.stand(Arc::clone(manager), handle, mapping);
+    let conditions = conditions.unwrap_or_default();
+    alarms.stand(Arc::clone(manager), handle, mapping, conditions);
+}
+
+/// Opens the file of the history, if the mapping names a file.
+fn history(described: &Server, layout: &Layout) -> Result<Option<(Store, Vec<Stored>)>, Failure> {
+    let file = described.history_file.as_ref();
+    let opened = file.map(|file| Store::open(file, layout.topics.iter()));
+    let opened = opened.transpose();
+    opened.map_err(|fault| Failure::new(FailureKind::Io, fault.to_string()))
 }
 
 fn places(handle: &ServerHandle, manager: &Arc<SpaceManager>) -> Places {
@@ -705,12 +745,6 @@ fn looks() -> Interval {
 fn limit(nodes: &SpaceNodes, mapping: &Mapping) {
     nodes.limit_writes(largest_write(mapping));
     nodes.limit_past(mapping);
-}
-
-/// Returns the capabilities of the server.
-fn capabilities(described: &Server) -> Vec<(VariableId, Variant)> {
-    let limits = endpoint::within(described.limits);
-    [history::capabilities(), identity::capabilities(&limits)].concat()
 }
 
 /// Returns the topics that are written here, in their initial state.

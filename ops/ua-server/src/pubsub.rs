@@ -13,6 +13,7 @@ mod states;
 mod tree;
 
 use std::collections::{HashMap, HashSet};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use bridge_node::{Counters, Router};
@@ -29,8 +30,9 @@ use plant_opcua::server::{CoreMethod, MethodHandler, Refusal, method};
 use tokio::sync::Notify;
 use tracing::info;
 
-use self::counts::{Counts, Diagnostics};
+use self::counts::{Counts, Diagnostics, LiveCounts, Totals};
 use self::file::Content;
+use self::insert::Wanted;
 pub(crate) use self::readers::Readers;
 pub(crate) use self::states::State;
 use self::states::{Change, States};
@@ -40,6 +42,8 @@ use crate::nodes::SpaceManager;
 /// The configuration in the address spaces.
 pub(crate) struct PubSub {
     inner: Mutex<Inner>,
+    /// True while the nodes of readers do not exist, because no client has looked at them.
+    has_no_readers: AtomicBool,
     /// The topics with a writer or reader that is off.
     off: RwLock<HashSet<TopicId>>,
     /// Notified when a client has enabled or disabled a component.
@@ -71,6 +75,8 @@ struct Inner {
     switched: HashMap<TopicId, bool>,
     /// The configuration as a file.
     content: Content,
+    /// The configuration, while the nodes of its readers do not exist.
+    unseen: Option<(Arc<Mapping>, Arc<Layout>)>,
 }
 
 impl Inner {
@@ -88,9 +94,9 @@ struct Part {
     parent: Option<usize>,
     state: NodeId,
     diagnostics: Option<Diagnostics>,
-    /// The number of components below a group, and the number of operational components among them,
-    /// as they are shown. `None` for other components.
-    live: Option<([NodeId; 2], [u16; 2])>,
+    /// The numbers of writers and readers below a component; `None` for components that do not show
+    /// them.
+    live: Option<LiveCounts>,
     counts: Counts,
 }
 
@@ -117,6 +123,7 @@ impl PubSub {
     pub(crate) fn new() -> Self {
         Self {
             inner: Mutex::default(),
+            has_no_readers: AtomicBool::new(true),
             off: RwLock::default(),
             called: Notify::new(),
             places: OnceLock::new(),
@@ -170,11 +177,12 @@ impl PubSub {
             }
         }
         drop(self.places.set(places));
+        self.write(LiveCounts::of_the_whole().zeros());
     }
 
     /// Shows the configuration of a mapping, replacing the previous configuration. Disabled
     /// components that still exist stay disabled.
-    pub(crate) fn show(&self, mapping: &Mapping, layout: &Layout) {
+    pub(crate) fn show(&self, mapping: &Arc<Mapping>, layout: &Arc<Layout>) {
         let Some(places) = self.places.get() else {
             return;
         };
@@ -186,7 +194,13 @@ impl PubSub {
                 drop(address_space.delete(&node, true));
             }
             let switched = std::mem::take(&mut inner.switched);
-            *inner = insert::all(mapping, layout, &mut address_space);
+            let is_unseen = self.has_no_readers.load(Ordering::Relaxed);
+            let wanted = match is_unseen {
+                true => Wanted::WithoutReaders,
+                false => Wanted::All,
+            };
+            *inner = insert::all(mapping, layout, &mut address_space, wanted);
+            inner.unseen = is_unseen.then(|| (Arc::clone(mapping), Arc::clone(layout)));
             inner.switched = switched;
         }
         let again: Vec<usize> = inner
@@ -203,6 +217,34 @@ impl PubSub {
         self.show_states(&inner);
         drop(inner);
         self.show_file();
+    }
+
+    /// Adds the nodes of the readers if they do not exist and one of `nodes` is the object of readers
+    /// or a node below it. Cells have many readers, and most clients look at none.
+    pub(crate) fn look_for_readers<'n>(&self, mut nodes: impl Iterator<Item = &'n NodeId>) {
+        if !self.has_no_readers.load(Ordering::Relaxed) || !nodes.any(insert::leads_to_readers) {
+            return;
+        }
+        let Some(places) = self.places.get() else {
+            return;
+        };
+        let mut inner = self.inner.lock();
+        let Some((mapping, layout)) = inner.unseen.take() else {
+            return;
+        };
+        {
+            let mut address_space = places.space.address_space().write();
+            let readers = insert::all(&mapping, &layout, &mut address_space, Wanted::Readers);
+            inner.made.extend(readers.made);
+        }
+        let diagnostics = inner
+            .parts
+            .iter()
+            .filter_map(|part| part.diagnostics.as_ref());
+        let shown = diagnostics.flat_map(Diagnostics::shown).collect();
+        self.write(shown);
+        self.show_states(&inner);
+        self.has_no_readers.store(false, Ordering::Relaxed);
     }
 
     /// Calls a method of a component. Returns `None` if the node is no such method.
@@ -339,11 +381,11 @@ impl PubSub {
     }
 
     fn show_counts(&self, inner: &mut Inner) {
-        let mut below: Vec<([u16; 2], bool)> = vec![([0; 2], false); inner.parts.len()];
+        let mut below: Vec<(Totals, bool)> = vec![(Totals::default(), false); inner.parts.len()];
         let mut changes = Vec::new();
         for at in (0..inner.parts.len()).rev() {
-            let state = inner.states.of(at);
-            let (numbers, errors) = below.get(at).copied().unwrap_or_default();
+            let operational = u16::from(inner.states.of(at) == State::Operational);
+            let (mut numbers, errors) = below.get(at).copied().unwrap_or_default();
             let Some(part) = inner.parts.get_mut(at) else {
                 continue;
             };
@@ -352,19 +394,16 @@ impl PubSub {
                 changes.extend(diagnostics.changes(part.counts, errors));
                 any |= diagnostics.has_errors();
             }
-            if let Some((nodes, shown)) = &mut part.live
-                && *shown != numbers
-            {
-                *shown = numbers;
-                let values = numbers.map(Variant::UInt16);
-                changes.extend(nodes.clone().into_iter().zip(values));
+            match part.kind {
+                Kind::Writer(_) => numbers.writers = [1, operational],
+                Kind::Reader(_) => numbers.readers = [1, operational],
+                Kind::Whole | Kind::Connection | Kind::Writers(_) | Kind::Readers(..) => {}
             }
-            let operational = u16::from(state == State::Operational);
-            if let Some(([all, live], failed)) = part.parent.and_then(|at| below.get_mut(at)) {
-                if matches!(part.kind, Kind::Writer(_) | Kind::Reader(_)) {
-                    *all = all.saturating_add(1);
-                    *live = live.saturating_add(operational);
-                }
+            if let Some(live) = &mut part.live {
+                changes.extend(live.changes(numbers));
+            }
+            if let Some((all, failed)) = part.parent.and_then(|at| below.get_mut(at)) {
+                all.add(numbers);
                 *failed |= any;
             }
         }

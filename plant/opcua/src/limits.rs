@@ -30,6 +30,10 @@ pub const MOST_PER_REQUEST: usize = 500;
 pub const MOST_SESSIONS: usize = 50;
 /// Maximum number of bytes of queued notifications, for all clients of a server.
 pub const QUEUED_NOTIFICATIONS: usize = 64 << 20;
+/// Maximum number of waiting Publish requests of a session for each of its subscriptions.
+pub const PUBLISH_REQUESTS: usize = 20;
+/// Maximum number of waiting Publish requests of a session.
+pub const MOST_PUBLISH_REQUESTS: usize = 200;
 /// Maximum number of requests of a connection that a server processes at a time, without Publish
 /// requests.
 pub const REQUESTS_IN_FLIGHT: usize = 1_000;
@@ -176,6 +180,8 @@ pub fn server(clients: ClientLimits) -> Limits {
             max_monitored_item_queue_size: 1_000,
             max_notifications_per_publish: MOST_NOTIFICATIONS as u64,
             max_queued_notifications: 100,
+            max_publish_requests_per_subscription: PUBLISH_REQUESTS,
+            max_pending_publish_requests: MOST_PUBLISH_REQUESTS,
             ..SubscriptionLimits::default()
         },
         operational: OperationalLimits::default(),

@@ -190,6 +190,73 @@ fn conditions_are_refreshed_for_the_subscription_that_asks() {
 }
 
 #[test]
+fn events_of_conditions_have_a_history_at_the_server_and_at_their_folder() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = serving(&cell, ALARMS);
+    for (node, kind, value) in [
+        ("ns=2;i=30", "Double", "95"),
+        ("ns=2;i=33", "Int32", "3"),
+        ("ns=2;i=30", "Double", "75"),
+        ("ns=2;i=30", "Double", "20"),
+    ] {
+        assert_eq!(write(&cell, node, kind, value), "Good");
+    }
+    let level = [json!("HighHigh"), json!("High"), Value::Null];
+    for (node, count, answers) in [("i=2253", "0", 1), ("ns=1;s=UaSpace.Alarms", "2", 2)] {
+        // ExclusiveLimitAlarmType; the mode is of another type.
+        let arguments = ["--node", node, "--type", "i=9341", "--history", count];
+        let arguments = [&[SERVER_ENDPOINT][..], &arguments].concat();
+        let mut told = cell.asyncua_once("opcua_alarms.py", &arguments);
+        let end = told.pop().unwrap();
+        assert_eq!(end["answers"], answers, "{node}: {told:?}");
+        // SubscribeToEvents and HistoryRead.
+        assert_eq!(end["notifier"], 5, "{node}");
+        let limits: Vec<&Value> = told.iter().map(|event| &event["limit"]).collect();
+        assert_eq!(limits, level.each_ref(), "{node}: {told:?}");
+        assert!(
+            told.iter().all(|event| event["name"] == "level"),
+            "{told:?}"
+        );
+    }
+}
+
+#[test]
+fn an_acknowledged_alarm_stays_acknowledged_over_a_restart() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let file = cell.folder().join("history.redb");
+    let mapping = ALARMS.replace(
+        "server:\n",
+        &format!("server:\n  history: {{file: {}}}\n", file.display()),
+    );
+    let mut server = serving(&cell, &mapping);
+    let mut anna = Watcher::start(&cell, &[]);
+    assert_eq!(write(&cell, "ns=2;i=30", "Double", "75"), "Good");
+    let seen = anna.sees(&json!({"name": "level", "active": true, "acked": false}));
+    let acknowledged = anna.call(&method("Acknowledge", &seen, "on my way"));
+    assert_eq!(acknowledged, "Good");
+    drop(anna);
+    server.signal(nix::sys::signal::Signal::SIGTERM);
+    assert!(server.wait_for_end(SOON).success());
+
+    let _server = serving(&cell, &mapping);
+    let node = |path: &str| read(&cell, &format!("ns=1;s=ua_0_2_30.alarm|{path}"))["value"].clone();
+    assert_eq!(node("ActiveState.Id"), json!(true));
+    assert_eq!(node("AckedState.Id"), json!(true));
+    assert_eq!(node("ConfirmedState.Id"), json!(false));
+    // The value is still in alarm, which is nothing new.
+    let mut bert = Watcher::start(&cell, &[]);
+    assert_eq!(write(&cell, "ns=2;i=30", "Double", "76"), "Good");
+    let seen = bert.sees(&json!({"name": "level", "acked": true, "comment": "on my way"}));
+    assert_eq!(bert.call(&method("Confirm", &seen, "")), "Good");
+    assert_eq!(write(&cell, "ns=2;i=30", "Double", "95"), "Good");
+    bert.sees(&json!({"limit": "HighHigh", "acked": false}));
+}
+
+#[test]
 fn node_opcua_lists_and_acknowledges_the_alarm_that_was_active_before() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
         return;

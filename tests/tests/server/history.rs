@@ -1,5 +1,9 @@
 //! The history of values: raw and as aggregates, checked with asyncua and node-opcua.
 
+use std::fs;
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, UadpSocket, eventually};
 use uadp::{DataSetHeader, Timestamp};
@@ -335,4 +339,66 @@ fn the_last_thousand_values_are_kept_and_variables_and_server_say_so() {
             "WorstQuality"
         ])
     );
+}
+
+#[test]
+fn the_history_in_a_file_survives_a_killed_and_a_stopped_server() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let file = cell.folder().join("below/history.redb");
+    let text = format!(
+        "{MAPPING}server:\n  history: {{values: 4, file: {}}}\n",
+        file.display()
+    );
+    let mapping = cell.file("kept.yaml", &text);
+    let served = || {
+        let server = cell.ua_server(&[mapping.to_str().unwrap()]);
+        eventually("the server answers clients", SOON, || {
+            cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
+        });
+        server
+    };
+    let sends = |values: &[(u16, i32, f64)]| {
+        let group = UadpSocket::join();
+        let mut watch = watch(&cell, TEMPERATURE_NODE);
+        for (sequence, at, value) in values {
+            group.send(&sample(*sequence, (*at, *value), None));
+            shows(&mut watch, "Good", &json!(value));
+        }
+    };
+    // The values and the lower halves of their statuses.
+    let raw = || {
+        let question = json!([{"node": TEMPERATURE_NODE, "start": 0, "count": 10}]);
+        let told = asyncua(&cell, &question);
+        let values = told[0]["values"].as_array().unwrap().clone();
+        values.iter().map(|one| one[1].clone()).collect::<Vec<_>>()
+    };
+
+    let mut server = served();
+    let written = || fs::metadata(&file).ok()?.modified().ok();
+    let before = written();
+    assert!(before.is_some(), "the file is created at the start");
+    sends(&[(1, 0, 1.0), (2, 1000, 2.0), (3, 2000, 3.0)]);
+    // Changes are written within half a second.
+    eventually("the values are in the file", SOON, || {
+        let is_quiet = written()?.elapsed().ok()? > Duration::from_secs(2);
+        (written() != before && is_quiet).then_some(())
+    });
+    server.signal(Signal::SIGKILL);
+    assert!(!server.wait_for_end(SOON).success());
+
+    let mut server = served();
+    // The last entry marks the time without the server.
+    assert_eq!(raw(), [json!(1.0), json!(2.0), json!(3.0), Value::Null]);
+    sends(&[(4, 600_000_000, 4.0)]);
+    server.signal(Signal::SIGTERM);
+    assert!(server.wait_for_end(SOON).success());
+
+    // The file has as many values as the memory.
+    let _server = served();
+    let kept = raw();
+    assert_eq!(kept.len(), 4, "{kept:?}");
+    assert!(kept.contains(&json!(4.0)), "{kept:?}");
+    assert!(!kept.contains(&json!(1.0)), "{kept:?}");
 }

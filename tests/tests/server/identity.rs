@@ -77,6 +77,83 @@ fn a_client_is_told_which_build_and_limits_and_namespaces_the_server_has_and_who
     }
 }
 
+/// Bits of PermissionType (OPC 10000-3, 8.55).
+const BROWSE: u64 = 1;
+const READ_ROLE_PERMISSIONS: u64 = 2;
+const READ: u64 = 32;
+const WRITE: u64 = 64;
+const READ_HISTORY: u64 = 128;
+const CALL: u64 = 4096;
+
+#[test]
+fn clients_read_profiles_roles_and_permissions() {
+    let Some((cell, _server)) = served() else {
+        return;
+    };
+    let method = "ns=0;i=15215";
+    let nodes = [
+        "--roles",
+        TEMPERATURE_NODE,
+        "ns=2;i=30",
+        method,
+        "ns=2;i=9999",
+    ];
+    let arguments = [&[SERVER_ENDPOINT][..], &nodes].concat();
+    let told = cell.asyncua_once("opcua_tree.py", &arguments);
+    let told = &told[0];
+    let profile = |name: &str| json!(format!("http://opcfoundation.org/UA-Profile/Server/{name}"));
+    let profiles = told["profiles"].as_array().unwrap();
+    // The server has fewer than 50 sessions, and no security.
+    assert_eq!(profiles[0], profile("MicroEmbeddedDevice2017"));
+    for name in ["Methods", "HistoricalRawData", "ACAlarm"] {
+        assert!(profiles.contains(&profile(name)), "{name} of {told}");
+    }
+    assert_eq!(told["monitored"], told["profiles"]);
+    assert_eq!(told["stamped"], true, "{told}");
+    assert_eq!(told["rate"], 0.0, "values are reported on change");
+
+    let roles = told["roles"].as_object().unwrap();
+    let names: Vec<&str> = roles.keys().map(String::as_str).collect();
+    let known = [
+        "Anonymous",
+        "AuthenticatedUser",
+        "ConfigureAdmin",
+        "Engineer",
+        "Observer",
+        "Operator",
+        "SecurityAdmin",
+    ];
+    assert_eq!(names, known, "{told}");
+    for role in roles.values() {
+        assert_eq!(role["parts"], json!(["Identities"]), "{told}");
+    }
+    let anonymous = json!([["Anonymous", ""]]);
+    assert_eq!(roles["Operator"]["identities"], anonymous);
+    assert_eq!(roles["Engineer"]["identities"], json!([]));
+
+    let seen = BROWSE | READ_ROLE_PERMISSIONS;
+    let read = seen | READ | READ_HISTORY;
+    let (observer, operator, engineer) = (15_668, 15_680, 16_036);
+    let of = |node: &str| &told["permissions"][node];
+    for node in [TEMPERATURE_NODE, "ns=2;i=30"] {
+        let user = json!([[observer, read], [operator, read | WRITE]]);
+        assert_eq!(of(node)["UserRolePermissions"], user, "{told}");
+        let all = of(node)["RolePermissions"].as_array().unwrap();
+        assert!(all.contains(&json!([engineer, read | WRITE])), "{told}");
+        assert_eq!(all.len(), 5, "{told}");
+        assert_eq!(of(node)["AccessRestrictions"], 0, "{told}");
+    }
+    // CurrentRead and HistoryRead; CurrentRead and CurrentWrite.
+    assert_eq!(of(TEMPERATURE_NODE)["AccessLevelEx"], 5, "{told}");
+    assert_eq!(of("ns=2;i=30")["AccessLevelEx"], 3, "{told}");
+    let keys = of(method);
+    assert_eq!(keys["AccessRestrictions"], 2, "EncryptionRequired: {told}");
+    assert_eq!(keys["AccessLevelEx"], "BadAttributeIdInvalid", "{told}");
+    let user = json!([[observer, seen | CALL], [operator, seen | CALL]]);
+    assert_eq!(keys["UserRolePermissions"], user, "{told}");
+    assert_eq!(of("ns=2;i=9999")["RolePermissions"], "BadNodeIdUnknown");
+}
+
 #[test]
 fn a_value_has_its_description_and_precision_and_as_much_history_as_was_asked_for() {
     let Some((cell, _server)) = served() else {

@@ -76,6 +76,10 @@ fn a_client_finds_what_is_sent_and_heard_with_its_metadata_below_publish_subscri
         return;
     };
     let _server = server(&cell);
+    // The nodes of readers are added when a client looks at them.
+    let state = "ns=1;s=PubSub.space.readers 2 2.ua_2_2_10.Status.State";
+    let read = cell.asyncua_once("opcua_read.py", &[SERVER_ENDPOINT, state]);
+    assert_eq!(read[0]["value"], PRE_OPERATIONAL, "{read:?}");
     let mut client = Client::of(&cell);
     let walked = client.told("walk");
     assert_eq!(walked["bad"], json!([]), "{walked}");
@@ -87,6 +91,18 @@ fn a_client_finds_what_is_sent_and_heard_with_its_metadata_below_publish_subscri
     assert_eq!(client.read("space/PublisherId"), 0);
     let url = client.read("space/Address/Url");
     assert!(url.as_str().unwrap().starts_with("opc.udp://"), "{url}");
+    let resolved = client.read("space/Diagnostics/LiveValues/ResolvedAddress");
+    assert_eq!(resolved, url);
+    // Part 14, 9.1.11: the live values of the root, of the groups, and their levels.
+    for counted in [
+        "Diagnostics/LiveValues/ConfiguredDataSetReaders",
+        "space/readers 2 2/Diagnostics/LiveValues/ConfiguredDataSetReaders",
+        "Diagnostics/LiveValues/ConfiguredDataSetWriters",
+        "space/writers 2/Diagnostics/LiveValues/OperationalDataSetWriters",
+    ] {
+        client.becomes(counted, &json!(1));
+        assert_eq!(client.read(&format!("{counted}/DiagnosticsLevel")), 0);
+    }
     let profile = client.read("space/TransportProfileUri");
     assert_eq!(
         profile,

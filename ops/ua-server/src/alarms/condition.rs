@@ -58,6 +58,16 @@ impl Levels {
         self.0 & !before.filled().0 != 0
     }
 
+    /// Returns the levels as bits.
+    pub(crate) const fn bits(self) -> u8 {
+        self.0
+    }
+
+    /// Returns the levels of known bits.
+    pub(crate) const fn from_bits(bits: u8) -> Self {
+        Self(bits & 31)
+    }
+
     /// Returns the name of the outermost level.
     pub(crate) const fn name(self) -> &'static str {
         match self.outermost() {
@@ -159,7 +169,35 @@ pub(crate) struct Condition {
     unacknowledged: VecDeque<ByteString>,
 }
 
+/// The content of a condition that survives a restart.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Parts {
+    pub(crate) state: State,
+    pub(crate) events: Vec<ByteString>,
+    pub(crate) unacknowledged: Vec<ByteString>,
+}
+
 impl Condition {
+    /// Returns the content that survives a restart.
+    pub(crate) fn parts(&self) -> Parts {
+        Parts {
+            state: self.state.clone(),
+            events: self.events.iter().cloned().collect(),
+            unacknowledged: self.unacknowledged.iter().cloned().collect(),
+        }
+    }
+
+    /// Replaces the state by the state before a restart.
+    pub(crate) fn restore(&mut self, parts: Parts) {
+        let last = |ids: Vec<ByteString>| {
+            let over = ids.len().saturating_sub(MOST_EVENTS);
+            ids.into_iter().skip(over).collect()
+        };
+        self.state = parts.state;
+        self.events = last(parts.events);
+        self.unacknowledged = last(parts.unacknowledged);
+    }
+
     /// Creates a condition that is enabled, inactive and acknowledged.
     pub(crate) fn new(confirms: bool, severity: u16, stamp: Stamp) -> Self {
         let at = stamp.time;

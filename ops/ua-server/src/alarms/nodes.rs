@@ -163,7 +163,7 @@ pub(super) fn add_folder(address_space: &mut AddressSpace) {
         LocalizedText::from("Alarms"),
     )
     .is_folder()
-    .event_notifier(EventNotifier::SUBSCRIBE_TO_EVENTS)
+    .event_notifier(EventNotifier::SUBSCRIBE_TO_EVENTS | EventNotifier::HISTORY_READ)
     .organized_by(address::root())
     .reference(
         ObjectId::Server,

@@ -100,6 +100,11 @@ impl Trigger {
         }
     }
 
+    /// Sets the levels before a restart.
+    pub(crate) const fn restore(&mut self, levels: Levels) {
+        self.levels = levels;
+    }
+
     /// Returns the levels of the last value that was compared.
     pub(crate) const fn levels(&self) -> Levels {
         self.levels

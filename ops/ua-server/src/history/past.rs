@@ -3,7 +3,10 @@
 use std::collections::{HashMap, VecDeque};
 
 use mappings::TopicId;
+use opcua::types::StatusCode;
+use uadp::Timestamp;
 
+use super::store::{Store, Stored};
 use crate::values::Shown;
 
 /// Past values, oldest first in each topic.
@@ -19,6 +22,8 @@ pub(crate) struct Past {
     /// The number of the next value.
     next: u64,
     topics: HashMap<TopicId, Kept>,
+    /// The file of the values.
+    store: Option<Store>,
 }
 
 #[derive(Debug, Default)]
@@ -37,7 +42,45 @@ impl Past {
             bytes: 0,
             next: 0,
             topics: HashMap::new(),
+            store: None,
         }
+    }
+
+    /// Adds the values of a file, and stores all further values in the file. Each topic gets the
+    /// mark `BadDataLost` for the time without the server (OPC 10000-11, 6.7).
+    pub(crate) fn keep_in(&mut self, store: Store, stored: Vec<Stored>) {
+        let last = stored.iter().map(|(_, _, shown)| shown.stamp.server).max();
+        let next = stored.iter().map(|(_, number, _)| *number + 1).max();
+        self.next = self.next.max(next.unwrap_or_default());
+        self.store = Some(store);
+        for (topic, number, shown) in stored {
+            self.insert(topic, number, shown);
+        }
+        self.enforce();
+        let Some(last) = last else { return };
+        let mut lost = Shown::nothing(StatusCode::BadDataLost);
+        lost.stamp.server = last;
+        lost.stamp.source = Some(Timestamp {
+            time: uadp::DateTime(last.ticks()),
+            picoseconds: 0,
+        });
+        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        for topic in topics {
+            self.keep(topic, &lost);
+        }
+    }
+
+    /// Writes the values that are not in the file, and stops storing values there.
+    pub(crate) fn close(&mut self) {
+        drop(self.store.take());
+    }
+
+    fn insert(&mut self, topic: TopicId, number: u64, shown: Shown) {
+        let size = size(&shown);
+        let kept = self.topics.entry(topic).or_default();
+        kept.values.push_back((number, shown));
+        kept.bytes += size;
+        self.bytes += size;
     }
 
     /// Changes the limits: values of each topic, bytes of all topics, and values of single topics.
@@ -47,10 +90,15 @@ impl Past {
         own: HashMap<TopicId, usize>,
     ) {
         (self.most_values, self.most_bytes, self.own) = (most_values, most_bytes, own);
+        self.enforce();
+    }
+
+    /// Drops the values beyond the limits.
+    fn enforce(&mut self) {
         for (topic, kept) in &mut self.topics {
-            let most = self.own.get(topic).copied().unwrap_or(most_values);
+            let most = self.own.get(topic).copied().unwrap_or(self.most_values);
             let over = kept.values.len().saturating_sub(most);
-            self.bytes -= kept.drop_oldest(over);
+            self.bytes -= kept.drop_oldest(over, (*topic, self.store.as_ref()));
         }
         while self.bytes > self.most_bytes {
             self.make_room();
@@ -65,13 +113,15 @@ impl Past {
         if most == 0 || size > self.most_bytes {
             return;
         }
-        let kept = self.topics.entry(topic).or_default();
-        kept.values.push_back((self.next, shown.clone()));
+        if let Some(store) = &self.store {
+            store.keep(topic, self.next, shown);
+        }
+        self.insert(topic, self.next, shown.clone());
         self.next += 1;
-        kept.bytes += size;
-        self.bytes += size;
-        if kept.values.len() > most {
-            self.bytes -= kept.drop_oldest(1);
+        if let Some(kept) = self.topics.get_mut(&topic)
+            && kept.values.len() > most
+        {
+            self.bytes -= kept.drop_oldest(1, (topic, self.store.as_ref()));
         }
         while self.bytes > self.most_bytes {
             self.make_room();
@@ -82,10 +132,10 @@ impl Past {
     /// pass therefore frees a large part of the rest, and passes are rare.
     fn make_room(&mut self) {
         let share = self.most_bytes / self.topics.len().max(1);
-        for kept in self.topics.values_mut() {
+        for (topic, kept) in &mut self.topics {
             if kept.bytes > share / 4 * 3 {
                 let half = kept.values.len().div_ceil(2);
-                self.bytes -= kept.drop_oldest(half);
+                self.bytes -= kept.drop_oldest(half, (*topic, self.store.as_ref()));
             }
         }
     }
@@ -101,14 +151,25 @@ impl Past {
         if let Some(gone) = self.topics.remove(&topic) {
             self.bytes -= gone.bytes;
         }
+        if let Some(store) = &self.store {
+            store.remove_before(topic, self.next);
+        }
     }
 }
 
 impl Kept {
-    /// Drops the oldest values and returns the number of freed bytes.
-    fn drop_oldest(&mut self, count: usize) -> usize {
+    /// Drops the oldest values, in the file too, and returns the number of freed bytes.
+    fn drop_oldest(&mut self, count: usize, (topic, store): (TopicId, Option<&Store>)) -> usize {
         let gone = self.values.drain(..count.min(self.values.len()));
-        let freed: usize = gone.map(|(_, gone)| size(&gone)).sum();
+        let mut behind = None;
+        let mut freed = 0;
+        for (number, gone) in gone {
+            freed += size(&gone);
+            behind = Some(number + 1);
+        }
+        if let (Some(store), Some(behind)) = (store, behind) {
+            store.remove_before(topic, behind);
+        }
         self.bytes -= freed;
         freed
     }
@@ -181,6 +242,26 @@ mod tests {
         assert_eq!(marks(&past, one), [4, 5]);
         assert_eq!(marks(&past, other), [5]);
         assert_eq!(past.bytes, 3 * (4 + BESIDE));
+    }
+
+    #[test]
+    fn values_of_a_file_come_first_and_the_time_without_the_server_is_marked() {
+        let topic = TopicId::new(1, 2, 3).unwrap();
+        let name = format!("ua-past-{}", std::process::id());
+        let file = std::env::temp_dir().join(name);
+        let opened = || Store::open(&file, std::iter::empty()).unwrap();
+        let stored = (4..8).map(|number| (topic, number, value(4, 1)));
+        let mut past = Past::new(3, 1 << 20);
+        past.keep_in(opened().0, stored.collect());
+        let kept = past.of(topic);
+        let numbers: Vec<u64> = kept.iter().map(|(number, _)| *number).collect();
+        assert_eq!(numbers, [6, 7, 8]);
+        let (_, mark) = kept.last().unwrap();
+        assert_eq!(mark.stamp.status, StatusCode::BadDataLost);
+        past.close();
+        // The file is free again.
+        drop(opened());
+        drop(std::fs::remove_file(&file));
     }
 
     #[test]

@@ -2,10 +2,12 @@
 //! `/metrics`.
 
 use bridge_node::{Counters, Reason};
-use opcua::types::{DataTypeId, NodeId, ObjectTypeId, ReferenceTypeId, VariableTypeId, Variant};
+use opcua::types::{
+    DataTypeId, NodeId, ObjectTypeId, ReferenceTypeId, VariableId, VariableTypeId, Variant,
+};
 
 use super::states::{Cause, Change, State};
-use super::tree::{At, Tree};
+use super::tree::{At, BASIC, Tree};
 
 /// The counters of a topic, or of all topics of a group.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -150,13 +152,14 @@ struct Shown {
 }
 
 impl Diagnostics {
-    /// Adds the counters below a component. Also returns the method that resets them.
+    /// Adds the counters below a component. Also returns the method that resets them, and the object
+    /// of the live values.
     pub(super) fn insert(
         tree: &mut Tree<'_>,
         above: &At,
         kind: ObjectTypeId,
         more: &[Counter],
-    ) -> (Self, NodeId) {
+    ) -> (Self, NodeId, At) {
         let object = tree.part("Diagnostics", kind, above);
         let level = (DataTypeId::DiagnosticsLevel, -1);
         tree.value("DiagnosticsLevel", level, BASIC, &object);
@@ -164,6 +167,7 @@ impl Diagnostics {
         let error = total(tree, "TotalError", true, &object);
         let sub_error = tree.value("SubError", (DataTypeId::Boolean, -1), false, &object);
         let reset = tree.method("Reset", &object);
+        let live = tree.part("LiveValues", ObjectTypeId::BaseObjectType, &object);
         let counters = tree.part("Counters", ObjectTypeId::BaseObjectType, &object);
         let all = Counter::OF_ALL.iter().chain(more);
         let counters = all.map(|counter| Shown {
@@ -181,7 +185,7 @@ impl Diagnostics {
             states: [0; 6],
             totals: (0, 0),
         };
-        (made, reset)
+        (made, reset, live)
     }
 
     /// Returns the counters of the object PublishSubscribe, which are in the core namespace.
@@ -257,9 +261,127 @@ impl Diagnostics {
         changes
     }
 
+    /// Returns all values as they are shown.
+    pub(super) fn shown(&self) -> Vec<(NodeId, Variant)> {
+        let counters = self.counters.iter();
+        let counters = counters.map(|one| (one.node.clone(), Variant::UInt32(one.shown)));
+        let totals = [
+            (self.information.clone(), Variant::UInt32(self.totals.0)),
+            (self.error.clone(), Variant::UInt32(self.totals.1)),
+            (self.sub_error.clone(), Variant::Boolean(self.below)),
+        ];
+        counters.chain(totals).collect()
+    }
+
     /// Returns true if an error was counted.
     pub(super) const fn has_errors(&self) -> bool {
         self.totals.1 > 0
+    }
+}
+
+/// The numbers of configured and operational components below a component (OPC 10000-14, 9.1.11).
+pub(super) struct LiveCounts {
+    nodes: Vec<(Live, NodeId)>,
+    shown: Totals,
+}
+
+/// The numbers of writers, operational writers, readers, and operational readers.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Totals {
+    pub(super) writers: [u16; 2],
+    pub(super) readers: [u16; 2],
+}
+
+impl Totals {
+    /// Adds numbers.
+    pub(super) fn add(&mut self, more: Self) {
+        for (sum, more) in [
+            (&mut self.writers, more.writers),
+            (&mut self.readers, more.readers),
+        ] {
+            for (sum, more) in sum.iter_mut().zip(more) {
+                *sum = sum.saturating_add(more);
+            }
+        }
+    }
+}
+
+/// A value of LiveValues.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Live {
+    Writers,
+    OperationalWriters,
+    Readers,
+    OperationalReaders,
+}
+
+impl Live {
+    const ALL: [(Self, &'static str); 4] = [
+        (Self::Writers, "ConfiguredDataSetWriters"),
+        (Self::OperationalWriters, "OperationalDataSetWriters"),
+        (Self::Readers, "ConfiguredDataSetReaders"),
+        (Self::OperationalReaders, "OperationalDataSetReaders"),
+    ];
+
+    const fn of(self, totals: Totals) -> u16 {
+        let Totals {
+            writers: [writers, operational_writers],
+            readers: [readers, operational_readers],
+        } = totals;
+        match self {
+            Self::Writers => writers,
+            Self::OperationalWriters => operational_writers,
+            Self::Readers => readers,
+            Self::OperationalReaders => operational_readers,
+        }
+    }
+}
+
+impl LiveCounts {
+    /// Adds the numbers of a group of writers or of readers.
+    pub(super) fn insert(tree: &mut Tree<'_>, live: &At, has_writers: bool) -> Self {
+        let kind = (DataTypeId::UInt16, -1);
+        let own = Live::ALL
+            .iter()
+            .filter(|(live, _)| {
+                let of_writers = matches!(live, Live::Writers | Live::OperationalWriters);
+                of_writers == has_writers
+            })
+            .map(|(which, name)| (*which, tree.live_value(name, kind, 0_u16, live)));
+        Self {
+            nodes: own.collect(),
+            shown: Totals::default(),
+        }
+    }
+
+    /// Returns the numbers of the object PublishSubscribe, which are in the core namespace.
+    pub(super) fn of_the_whole() -> Self {
+        let live = Live::ALL.iter().zip(WHOLE_LIVE);
+        let nodes = live.map(|((which, _), id)| (*which, NodeId::from(id)));
+        Self {
+            nodes: nodes.collect(),
+            shown: Totals::default(),
+        }
+    }
+
+    /// Returns the values that have changed.
+    pub(super) fn changes(&mut self, totals: Totals) -> Vec<(NodeId, Variant)> {
+        let before = std::mem::replace(&mut self.shown, totals);
+        let changed = self
+            .nodes
+            .iter()
+            .filter(|(which, _)| which.of(before) != which.of(totals));
+        changed
+            .map(|(which, node)| (node.clone(), Variant::UInt16(which.of(totals))))
+            .collect()
+    }
+
+    /// Returns the values of the object PublishSubscribe before the first change.
+    pub(super) fn zeros(&self) -> Vec<(NodeId, Variant)> {
+        let nodes = self.nodes.iter();
+        nodes
+            .map(|(_, node)| (node.clone(), Variant::UInt16(0)))
+            .collect()
     }
 }
 
@@ -290,10 +412,15 @@ fn node_text(node: &NodeId) -> String {
     }
 }
 
-/// DiagnosticsLevel Basic.
-const BASIC: i32 = 0;
 /// StateError and the following counters below PublishSubscribe.Diagnostics.Counters.
 const WHOLE: [u32; 6] = [17_424, 17_431, 17_436, 17_441, 17_446, 17_451];
+/// LiveValues of PublishSubscribe, in the order of [`Live::ALL`].
+const WHOLE_LIVE: [VariableId; 4] = [
+    VariableId::PublishSubscribe_Diagnostics_LiveValues_ConfiguredDataSetWriters,
+    VariableId::PublishSubscribe_Diagnostics_LiveValues_OperationalDataSetWriters,
+    VariableId::PublishSubscribe_Diagnostics_LiveValues_ConfiguredDataSetReaders,
+    VariableId::PublishSubscribe_Diagnostics_LiveValues_OperationalDataSetReaders,
+];
 const WHOLE_INFORMATION: u32 = 17_411;
 const WHOLE_ERROR: u32 = 17_416;
 const WHOLE_SUB_ERROR: u32 = 17_422;

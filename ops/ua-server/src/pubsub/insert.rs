@@ -7,27 +7,45 @@ use mappings::{GroupMode, KeySource, Mapping, MessageMapping, SecurityGroup, Spa
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
     AttributeId, ConfigurationVersionDataType, DataSetMetaDataType, DataTypeId,
-    EndpointDescription, ExtensionObject, FieldMetaData, FieldTargetDataType, Guid, LocalizedText,
-    MessageSecurityMode, NodeId, ObjectId, ObjectTypeId, PublishedVariableDataType,
+    EndpointDescription, ExtensionObject, FieldMetaData, FieldTargetDataType, Guid, Identifier,
+    LocalizedText, MessageSecurityMode, NodeId, ObjectId, ObjectTypeId, PublishedVariableDataType,
     ReferenceTypeId, UAString, VariableId, Variant,
 };
 use tracing::warn;
 
-use super::counts::{Counter, Counts, Diagnostics};
+use super::counts::{Counter, Counts, Diagnostics, LiveCounts};
 use super::file::{self, Content};
 use super::states::State;
 use super::tree::{At, Tree};
 use super::{Ask, Inner, Kind, Part};
 use crate::layout::{Layout, TopicNode};
 
-/// Adds the components of a mapping and their nodes.
-pub(super) fn all(mapping: &Mapping, layout: &Layout, address_space: &mut AddressSpace) -> Inner {
+/// The nodes to add.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Wanted {
+    /// All nodes except the nodes of readers.
+    WithoutReaders,
+    /// The nodes of readers only.
+    Readers,
+    /// All nodes.
+    All,
+}
+
+/// Adds the components of a mapping and the wanted nodes.
+pub(super) fn all(
+    mapping: &Mapping,
+    layout: &Layout,
+    address_space: &mut AddressSpace,
+    wanted: Wanted,
+) -> Inner {
+    let has_others = wanted != Wanted::Readers;
     let mut insert = Insert {
         mapping,
         inner: Inner::default(),
         tree: Tree {
             address_space,
             made: Vec::new(),
+            is_dry: !has_others,
         },
     };
     let whole = insert.whole();
@@ -50,7 +68,9 @@ pub(super) fn all(mapping: &Mapping, layout: &Layout, address_space: &mut Addres
         if space == SpaceId::UA {
             insert.writer(topic, (group, &above), detailed);
         } else {
+            insert.tree.is_dry = wanted == Wanted::WithoutReaders;
             insert.reader(topic, (group, &above), detailed);
+            insert.tree.is_dry = !has_others;
         }
     }
     let Insert { inner, tree, .. } = insert;
@@ -76,7 +96,7 @@ impl Insert<'_> {
             parent: None,
             state: VariableId::PublishSubscribe_Status_State.into(),
             diagnostics: Some(Diagnostics::of_the_whole()),
-            live: None,
+            live: Some(LiveCounts::of_the_whole()),
             counts: Counts::default(),
         });
         at
@@ -89,14 +109,15 @@ impl Insert<'_> {
         self.tree.property("MimeType", mime, UA_BINARY, &file);
     }
 
-    /// Adds a component with its Status, and with counters if it has any.
+    /// Adds a component with its Status, and with counters if it has any. Also returns the object of
+    /// the live values.
     fn part(
         &mut self,
         kind: Kind,
         (parent, own): (usize, State),
         object: &At,
         counters: Option<(ObjectTypeId, &[Counter])>,
-    ) -> usize {
+    ) -> (usize, Option<At>) {
         let at = self.inner.states.add(Some(parent), own);
         let status = self
             .tree
@@ -107,9 +128,11 @@ impl Insert<'_> {
             (self.tree.method("Enable", &status), Ask::Enable),
             (self.tree.method("Disable", &status), Ask::Disable),
         ];
+        let mut live = None;
         let diagnostics = counters.map(|(kind, counters)| {
-            let (made, reset) = Diagnostics::insert(&mut self.tree, object, kind, counters);
+            let (made, reset, values) = Diagnostics::insert(&mut self.tree, object, kind, counters);
             methods.push((reset, Ask::Reset));
+            live = Some(values);
             made
         });
         let asked = methods.into_iter().map(|(node, ask)| (node, (at, ask)));
@@ -122,7 +145,7 @@ impl Insert<'_> {
             live: None,
             counts: Counts::default(),
         });
-        at
+        (at, live)
     }
 
     /// Adds the connection. Its address is the group that all programs send to.
@@ -147,15 +170,19 @@ impl Insert<'_> {
         let address = tree.part("Address", ObjectTypeId::NetworkAddressUrlType, &object);
         let interface = pubsub.interface.as_deref().unwrap_or_default();
         tree.selection("NetworkInterface", interface, &address);
-        let url = url(self.mapping);
-        tree.value("Url", (DataTypeId::String, -1), url, &address);
+        let group = url(self.mapping);
+        tree.value("Url", (DataTypeId::String, -1), group.clone(), &address);
         let counters = (ObjectTypeId::PubSubDiagnosticsConnectionType, &[][..]);
-        let at = self.part(
+        let (at, live) = self.part(
             Kind::Connection,
             (whole, State::Operational),
             &object,
             Some(counters),
         );
+        if let Some(live) = live {
+            let text = (DataTypeId::String, -1);
+            self.tree.live_value("ResolvedAddress", text, group, &live);
+        }
         (at, object)
     }
 
@@ -203,13 +230,16 @@ impl Insert<'_> {
         if writes {
             self.writer_group(namespace, &object);
         }
-        let at = self.part(
+        let (at, live) = self.part(
             kind,
             (above, State::Operational),
             &object,
             Some((type_.1, counted)),
         );
-        self.live(at, &object, writes);
+        let counts = live.map(|live| LiveCounts::insert(&mut self.tree, &live, writes));
+        if let Some(part) = self.inner.parts.get_mut(at) {
+            part.live = counts;
+        }
         (at, object)
     }
 
@@ -241,24 +271,6 @@ impl Insert<'_> {
         );
         let offsets = (DataTypeId::Duration, 1);
         tree.property("PublishingOffset", offsets, Vec::<f64>::new(), &settings);
-    }
-
-    /// Adds the numbers of configured and operational components of a group.
-    fn live(&mut self, group: usize, object: &At, writes: bool) {
-        let id = format!("{}.Diagnostics", text(object));
-        let values = At::core(object.below("Diagnostics"), &id);
-        let live = self
-            .tree
-            .part("LiveValues", ObjectTypeId::BaseObjectType, &values);
-        let names = if writes {
-            ["ConfiguredDataSetWriters", "OperationalDataSetWriters"]
-        } else {
-            ["ConfiguredDataSetReaders", "OperationalDataSetReaders"]
-        };
-        let nodes = names.map(|name| self.tree.value(name, UINT16, 0_u16, &live));
-        if let Some(part) = self.inner.parts.get_mut(group) {
-            part.live = Some((nodes, [0; 2]));
-        }
     }
 
     /// Adds the writer of a value that this program sends, and its PublishedDataSet.
@@ -358,6 +370,17 @@ impl Insert<'_> {
             &object,
             detailed.then_some(counters),
         );
+    }
+}
+
+/// Returns true if a node is the connection, a group of readers, or a node below such a group.
+pub(super) fn leads_to_readers(node: &NodeId) -> bool {
+    match &node.identifier {
+        Identifier::String(text) => {
+            let rest = text.as_ref().strip_prefix(CONNECTION_ID);
+            rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(READERS))
+        }
+        Identifier::Numeric(_) | Identifier::Guid(_) | Identifier::ByteString(_) => false,
     }
 }
 
@@ -477,15 +500,6 @@ where
     Variant::from(ExtensionObject::from_message(value))
 }
 
-fn text(at: &At) -> String {
-    match &at.node.identifier {
-        opcua::types::Identifier::String(text) => text.as_ref().to_owned(),
-        opcua::types::Identifier::Numeric(_)
-        | opcua::types::Identifier::Guid(_)
-        | opcua::types::Identifier::ByteString(_) => at.node.to_string(),
-    }
-}
-
 /// Returns the TransportProfileUri (OPC 10000-7).
 pub(super) fn profile(mapping: &Mapping) -> &'static str {
     match &mapping.pubsub().broker {
@@ -519,6 +533,10 @@ pub(super) fn milliseconds(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
 }
 
+/// The identifier of the node of the connection, and the begin of the identifiers below it of groups
+/// of readers.
+const CONNECTION_ID: &str = "PubSub.space";
+const READERS: &str = ".readers ";
 /// The BrowseName of the connection.
 pub(super) const CONNECTION: &str = "space";
 const MQTT_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-mqtt-uadp";

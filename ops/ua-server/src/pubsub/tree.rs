@@ -11,6 +11,8 @@ use opcua::types::{
 pub(super) struct Tree<'a> {
     pub(super) address_space: &'a mut AddressSpace,
     pub(super) made: Vec<NodeId>,
+    /// If set, NodeIds are computed and no node is added.
+    pub(super) is_dry: bool,
 }
 
 /// An object to which nodes are added.
@@ -44,11 +46,13 @@ impl Tree<'_> {
         (above, reference): (&At, ReferenceTypeId),
     ) -> At {
         let node = above.below(name);
-        ObjectBuilder::new(&node, browse_name(name), LocalizedText::from(name))
-            .has_type_definition(kind)
-            .reference(above.node.clone(), reference, ReferenceDirection::Inverse)
-            .insert(self.address_space);
-        self.made.push(node.clone());
+        if !self.is_dry {
+            ObjectBuilder::new(&node, browse_name(name), LocalizedText::from(name))
+                .has_type_definition(kind)
+                .reference(above.node.clone(), reference, ReferenceDirection::Inverse)
+                .insert(self.address_space);
+            self.made.push(node.clone());
+        }
         At {
             node,
             id: format!("{}.{name}", above.id),
@@ -87,6 +91,24 @@ impl Tree<'_> {
         self.variable(name, kind, value, (above, as_))
     }
 
+    /// Adds a value of diagnostics with its DiagnosticsLevel.
+    pub(super) fn live_value(
+        &mut self,
+        name: &str,
+        kind: (DataTypeId, i32),
+        value: impl Into<Variant>,
+        above: &At,
+    ) -> NodeId {
+        let node = self.value(name, kind, value, above);
+        let at = At {
+            node: node.clone(),
+            id: format!("{}.{name}", above.id),
+        };
+        let level = (DataTypeId::DiagnosticsLevel, -1);
+        self.property("DiagnosticsLevel", level, BASIC, &at);
+        node
+    }
+
     /// Adds a variable that selects one of several texts.
     pub(super) fn selection(&mut self, name: &str, text: &str, above: &At) {
         let as_ = (
@@ -111,32 +133,38 @@ impl Tree<'_> {
         (above, (kind, reference)): (&At, (VariableTypeId, ReferenceTypeId)),
     ) -> NodeId {
         let node = above.below(name);
-        VariableBuilder::new(&node, browse_name(name), LocalizedText::from(name))
-            .data_type(data_type)
-            .value_rank(rank)
-            .value(value)
-            .has_type_definition(kind)
-            .reference(above.node.clone(), reference, ReferenceDirection::Inverse)
-            .insert(self.address_space);
-        self.made.push(node.clone());
+        if !self.is_dry {
+            VariableBuilder::new(&node, browse_name(name), LocalizedText::from(name))
+                .data_type(data_type)
+                .value_rank(rank)
+                .value(value)
+                .has_type_definition(kind)
+                .reference(above.node.clone(), reference, ReferenceDirection::Inverse)
+                .insert(self.address_space);
+            self.made.push(node.clone());
+        }
         node
     }
 
     /// Adds a method without arguments.
     pub(super) fn method(&mut self, name: &str, above: &At) -> NodeId {
         let node = above.below(name);
-        MethodBuilder::new(&node, browse_name(name), LocalizedText::from(name))
-            .component_of(above.node.clone())
-            .executable(true)
-            .user_executable(true)
-            .insert(self.address_space);
-        self.made.push(node.clone());
+        if !self.is_dry {
+            MethodBuilder::new(&node, browse_name(name), LocalizedText::from(name))
+                .component_of(above.node.clone())
+                .executable(true)
+                .user_executable(true)
+                .insert(self.address_space);
+            self.made.push(node.clone());
+        }
         node
     }
 
     /// Adds a reference between two nodes.
     pub(super) fn refer(&mut self, from: &NodeId, to: &NodeId, reference: ReferenceTypeId) {
-        self.address_space.insert_reference(from, to, reference);
+        if !self.is_dry {
+            self.address_space.insert_reference(from, to, reference);
+        }
     }
 }
 
@@ -174,5 +202,7 @@ fn browse_name(name: &str) -> QualifiedName {
     QualifiedName::new(namespace, name)
 }
 
+/// DiagnosticsLevel Basic.
+pub(super) const BASIC: i32 = 0;
 /// The namespace index of the application's own URI.
 const APPLICATION: u16 = 1;

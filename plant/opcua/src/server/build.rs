@@ -18,8 +18,11 @@ use opcua::sync::Mutex;
 use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, TypeLoader, UAString};
 
 use super::calls::Calls;
+use super::capabilities::{Facets, capabilities};
 use super::nodes::{Nodes, Spaces};
+use super::roles;
 use super::routed::{Front, Routed};
+use super::supplement::Supplement;
 use super::{Inner, Server, Waiting};
 use crate::door::{Door, UnknownClients};
 use crate::endpoint::{BindError, EndpointUrl};
@@ -276,12 +279,14 @@ impl ServerBuilder {
             .with_node_manager(Core {
                 made: Arc::clone(&made),
                 calls: Arc::clone(&calls),
+                supplement: supplement(&config, self.users.as_ref()),
             })
             .with_node_manager(Own {
                 made: Arc::clone(&made),
                 calls: Arc::clone(&calls),
                 sets,
                 namespaces: self.namespaces,
+                users: self.users.clone(),
             });
         let (server, handle) = built(builder, secured)?;
         if let Some(error) = made.error.lock().take() {
@@ -383,23 +388,38 @@ struct Made {
     error: Mutex<Option<NodeSetError>>,
 }
 
+/// Returns the values and attributes that the library does not serve.
+fn supplement(config: &ServerConfig, users: Option<&Arc<Access>>) -> Supplement {
+    let facets = Facets {
+        is_secured: config.security.iter().any(|one| *one != Security::None),
+        ..Facets::default()
+    };
+    let mut values = capabilities(&limits::server(config.clients), facets);
+    values.extend(users.into_iter().flat_map(roles::values));
+    Supplement::new(values, users.cloned())
+}
+
 /// Builds the node manager of the core namespace.
 struct Core {
     made: Arc<Made>,
     calls: Arc<Calls>,
+    supplement: Supplement,
 }
 
 impl NodeManagerBuilder for Core {
     fn build(self: Box<Self>, context: ServerContext) -> Arc<DynNodeManager> {
         let builder = Box::new(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder));
         let inner = builder.build(context);
-        if let Ok(core) = Arc::clone(&inner).into_any_arc().downcast() {
+        let core: Result<Arc<CoreNodeManager>, _> = Arc::clone(&inner).into_any_arc().downcast();
+        if let Ok(core) = core {
+            roles::prepare(&mut core.address_space().write());
             self.made.core.get_or_init(|| core);
         }
         Arc::new(Routed {
             inner,
             front: Front::Calls(self.calls),
             last: None,
+            supplement: self.supplement,
         })
     }
 }
@@ -410,6 +430,7 @@ struct Own {
     calls: Arc<Calls>,
     sets: Vec<NodeSet>,
     namespaces: Vec<String>,
+    users: Option<Arc<Access>>,
 }
 
 impl NodeManagerBuilder for Own {
@@ -419,6 +440,7 @@ impl NodeManagerBuilder for Own {
             calls,
             sets,
             namespaces,
+            users,
         } = *self;
         let sessions = Arc::clone(&calls.sessions);
         let fill = |context: ServerContext, address_space: &mut AddressSpace| {
@@ -456,6 +478,11 @@ impl NodeManagerBuilder for Own {
         }
         let last = calls.spaces.get().cloned();
         let front = Front::Calls(calls);
-        Arc::new(Routed { inner, front, last })
+        Arc::new(Routed {
+            inner,
+            front,
+            last,
+            supplement: Supplement::new(Vec::new(), users),
+        })
     }
 }

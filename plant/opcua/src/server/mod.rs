@@ -3,17 +3,21 @@
 //! Reading order: `build` (creates a server from its configuration), `view` (the nodes of both node
 //! managers), `instances` (nodes from types), `methods` (methods without declaration in a type),
 //! `nodes` (values and writes), `calls` and `routed` (method calls), `overlay` (methods of the core
-//! namespace), `sessions`, `events`.
+//! namespace), `supplement` (attributes and values that the library does not serve), `roles`,
+//! `capabilities`, `sessions`, `events`.
 
 mod build;
 mod calls;
+mod capabilities;
 mod events;
 mod instances;
 mod methods;
 mod nodes;
 mod overlay;
+pub mod roles;
 mod routed;
 mod sessions;
+mod supplement;
 mod view;
 
 use std::sync::Arc;
@@ -33,6 +37,7 @@ use tracing::{error, warn};
 
 pub use self::build::{Security, ServerBuilder, ServerConfig, ServerError};
 pub use self::calls::{MethodHandler, MethodRequest, Refusal, arguments_in, method};
+pub use self::capabilities::{Facets, capabilities, profiles};
 pub use self::events::{StateRef, TransitionEvent};
 pub use self::instances::{
     IdRange, Instance, InstanceError, InstanceSpec, ObjectSpec, VariableSpec,
@@ -42,6 +47,7 @@ pub use self::nodes::{WriteHandler, WriteRequest, write};
 pub use self::overlay::{CoreMethod, core_of, core_with};
 pub(crate) use self::sessions::ANONYMOUS;
 pub use self::sessions::{Caller, Presence};
+pub use self::supplement::{CoreValue, EventHistory, NodeFacts, Supplement};
 pub use self::view::Child;
 pub use crate::endpoint::EndpointUrl;
 
@@ -126,14 +132,14 @@ impl Server {
         });
         let sessions = Arc::clone(&self.inner.calls.sessions);
         let looking = tokio::spawn(async move {
-            let mut look = tokio::time::interval(sessions::LOOK);
-            look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-            for looks in 1_u64.. {
-                look.tick().await;
+            let mut waited = Duration::ZERO;
+            loop {
+                waited += sessions.wait(LOOK_AT_REJECTED).await;
                 sessions.look();
-                if !looks.is_multiple_of(LOOKS_AT_REJECTED) {
+                if waited < LOOK_AT_REJECTED {
                     continue;
                 }
+                waited = Duration::ZERO;
                 if let Some(users) = &users {
                     users.look();
                 }
@@ -378,7 +384,7 @@ pub fn value_of(variable: &Variable) -> DataValue {
     )
 }
 
-/// Checks of sessions per check of rejected certificates and users.
-const LOOKS_AT_REJECTED: u64 = 20;
+/// Interval of checking rejected certificates and users.
+const LOOK_AT_REJECTED: Duration = Duration::from_secs(1);
 /// Longest duration of stopping.
 pub const LONGEST_STOP: Duration = Duration::from_secs(2);

@@ -10,17 +10,15 @@ use opcua::server::node_manager::memory::{
     CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManagerBuilder,
 };
 use opcua::server::node_manager::{
-    DynNodeManager, MethodCall, NodeManagerBuilder, ReadNode, RequestContext, ServerContext,
+    DynNodeManager, MethodCall, NodeManagerBuilder, RequestContext, ServerContext,
 };
-use opcua::types::{
-    Argument, AttributeId, BrowseDirection, DataValue, NodeId, ReferenceTypeId, StatusCode,
-    VariableId, Variant,
-};
+use opcua::types::{Argument, BrowseDirection, NodeId, ReferenceTypeId, StatusCode};
 use tokio::time::Instant;
 
 use super::calls::{self, MethodHandler, MethodRequest, Refusal, check_arguments, within};
 use super::routed::{Front, Routed};
 use super::sessions::{Caller, Presence};
+use super::supplement::{NodeFacts, Supplement};
 use crate::audit::{Action, Audit};
 use crate::limits::LONGEST_REQUEST;
 
@@ -89,13 +87,13 @@ fn called(call: &MethodCall) -> Action {
     }
 }
 
-/// Builds the node manager of the core namespace with handlers for methods and with `values` of
-/// variables. `prepared` edits its nodes. The library returns its own values for some variables,
-/// whatever their nodes contain; `values` replace them.
+/// Builds the node manager of the core namespace with handlers for methods. `prepared` edits its
+/// nodes. The library returns its own values for some variables, whatever their nodes contain; the
+/// values of `supplement` replace them.
 #[must_use]
 pub fn core_with(
     methods: Vec<CoreMethod>,
-    values: Vec<(VariableId, Variant)>,
+    supplement: Supplement,
     prepared: impl FnOnce(&mut AddressSpace) + Send + 'static,
 ) -> impl NodeManagerBuilder + 'static {
     move |context: ServerContext| {
@@ -107,12 +105,9 @@ pub fn core_with(
         }
         Routed {
             inner,
-            front: Front::Core(Arc::new(Overlay {
-                methods,
-                values,
-                core,
-            })),
+            front: Front::Core(Arc::new(Overlay { methods, core })),
             last: None,
+            supplement,
         }
     }
 }
@@ -130,23 +125,13 @@ pub fn core_of(handle: &ServerHandle) -> Option<Arc<CoreNodeManager>> {
 /// The methods, and the address space with their declarations.
 pub(crate) struct Overlay {
     methods: Vec<CoreMethod>,
-    values: Vec<(VariableId, Variant)>,
     core: Option<Arc<CoreNodeManager>>,
 }
 
 impl Overlay {
-    /// Replaces values of the library by the configured values.
-    pub(crate) fn correct(&self, nodes: &mut [&mut ReadNode]) {
-        for node in nodes {
-            let asked = node.node();
-            let is_value = asked.attribute_id == AttributeId::Value;
-            let plain = is_value && !asked.index_range.has_range();
-            let id = asked.node_id.as_variable_id().ok().filter(|_| plain);
-            let known = id.and_then(|id| self.values.iter().find(|(known, _)| *known == id));
-            if let Some((_, value)) = known {
-                node.set_result(DataValue::value_only(value.clone()));
-            }
-        }
+    /// Returns the facts of a node of the core namespace.
+    pub(crate) fn facts(&self, node: &NodeId) -> Option<NodeFacts> {
+        NodeFacts::find(&self.core.as_ref()?.address_space().read(), node)
     }
 
     /// Executes the calls of these methods sequentially, and returns all other calls.

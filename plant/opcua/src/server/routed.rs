@@ -25,12 +25,26 @@ use opcua::types::{
 use super::calls::Calls;
 use super::nodes::Spaces;
 use super::overlay::Overlay;
+use super::supplement::{NodeFacts, Supplement};
 
 pub(crate) struct Routed {
     pub(crate) inner: Arc<DynNodeManager>,
     pub(crate) front: Front,
     /// Set for the last node manager, which is initialized after all types exist.
     pub(crate) last: Option<Arc<Spaces>>,
+    pub(crate) supplement: Supplement,
+}
+
+impl Routed {
+    fn facts(&self, node: &NodeId) -> Option<NodeFacts> {
+        match &self.front {
+            Front::Core(overlay) => overlay.facts(node),
+            Front::Calls(calls) => {
+                let spaces = calls.spaces.get()?;
+                spaces.with(|view| view.node(node).map(NodeFacts::of))
+            }
+        }
+    }
 }
 
 /// The handler of calls before the library.
@@ -92,10 +106,8 @@ impl NodeManager for Routed {
         nodes: &mut [&mut ReadNode],
     ) -> Done {
         self.inner.read(context, max_age, timestamps, nodes).await?;
-        match &self.front {
-            Front::Core(overlay) => overlay.correct(nodes),
-            Front::Calls(_) => {}
-        }
+        self.supplement
+            .complete(context, timestamps, nodes, |node| self.facts(node));
         Ok(())
     }
 
@@ -142,9 +154,17 @@ impl NodeManager for Routed {
         nodes: &mut [&mut HistoryNode],
         timestamps: TimestampsToReturn,
     ) -> Done {
-        self.inner
+        let done = self
+            .inner
             .history_read_events(context, details, nodes, timestamps)
-            .await
+            .await;
+        if let Err(status) = done {
+            for node in nodes.iter_mut() {
+                node.set_status(status);
+            }
+        }
+        self.supplement.read_events(context, details, nodes);
+        Ok(())
     }
 
     async fn history_read_annotations(
@@ -202,7 +222,9 @@ impl NodeManager for Routed {
         context: &RequestContext,
         items: &mut [&mut CreateMonitoredItem],
     ) -> Done {
-        self.inner.create_monitored_items(context, items).await
+        self.inner.create_monitored_items(context, items).await?;
+        self.supplement.begin(context, items);
+        Ok(())
     }
 
     async fn modify_monitored_items(

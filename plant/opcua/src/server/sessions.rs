@@ -7,6 +7,7 @@ use std::time::Duration;
 use opcua::server::node_manager::RequestContext;
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::MessageSecurityMode;
+use tokio::sync::Notify;
 
 type Told = Arc<dyn Fn(u32) + Send + Sync>;
 
@@ -85,6 +86,8 @@ impl Presence {
 #[derive(Default)]
 pub(crate) struct Sessions {
     watched: Mutex<HashMap<u32, Presence>>,
+    /// Notified when a session is added.
+    added: Notify,
     told: RwLock<Vec<Told>>,
 }
 
@@ -92,15 +95,29 @@ impl Sessions {
     /// Returns the client and user of a request, and starts to supervise the session.
     pub(crate) fn caller(&self, context: &RequestContext) -> Caller {
         let mut watched = self.watched.lock();
-        watched
-            .entry(context.session_id)
-            .or_insert_with(|| Presence::of(context));
+        watched.entry(context.session_id).or_insert_with(|| {
+            self.added.notify_one();
+            Presence::of(context)
+        });
         drop(watched);
         Caller::of(context)
     }
 
     pub(crate) fn tell(&self, told: Told) {
         self.told.write().push(told);
+    }
+
+    /// Waits until the sessions have to be checked: for [`LOOK`], or for at most `longest` while
+    /// there are none. Returns the time that has to be counted.
+    pub(crate) async fn wait(&self, longest: Duration) -> Duration {
+        if !self.watched.lock().is_empty() {
+            tokio::time::sleep(LOOK).await;
+            return LOOK;
+        }
+        match tokio::time::timeout(longest, self.added.notified()).await {
+            Ok(()) => Duration::ZERO,
+            Err(_) => longest,
+        }
     }
 
     /// Runs the callbacks for sessions that ended since the last call.
@@ -129,4 +146,19 @@ impl Sessions {
 /// The user name of anonymous users; reserved.
 pub(crate) const ANONYMOUS: &str = "anonymous";
 /// Interval of checking sessions.
-pub(crate) const LOOK: Duration = Duration::from_millis(50);
+const LOOK: Duration = Duration::from_millis(50);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn sessions_are_checked_often_only_while_there_are_any() {
+        let sessions = Sessions::default();
+        let longest = Duration::from_millis(1);
+        assert_eq!(sessions.wait(longest).await, longest);
+        let presence = Presence::while_(|| true);
+        sessions.watched.lock().insert(1, presence);
+        assert_eq!(sessions.wait(longest).await, LOOK);
+    }
+}

@@ -1,7 +1,7 @@
 //! Authentication and authorization: the library calls this module for each session and each
 //! request.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -61,6 +61,13 @@ impl Default for Permissions {
 }
 
 impl Permissions {
+    /// Grants every right to all roles.
+    pub const OPEN: Self = Self {
+        read: Roles::ALL,
+        write: Roles::ALL,
+        call: Roles::ALL,
+    };
+
     const fn of(&self, right: Right) -> Roles {
         match right {
             Right::Read => self.read,
@@ -89,6 +96,8 @@ pub struct Rules {
     pub anonymous: Anonymous,
     /// The nodes with other permissions than the default.
     pub nodes: HashMap<NodeId, Permissions>,
+    /// The methods that can be called over encrypted connections only.
+    pub encrypted: HashSet<NodeId>,
 }
 
 /// A login attempt, for audits.
@@ -186,7 +195,7 @@ impl Access {
         let access = Self::new(pki.map(|pki| pki.join(FOLDER)), false)?;
         access.set_rules(Rules {
             anonymous: Anonymous::Has(anonymous),
-            nodes: HashMap::new(),
+            ..Rules::default()
         });
         Ok(access)
     }
@@ -305,6 +314,35 @@ impl Access {
         };
         drop(rules);
         self.roles(token).meets(permissions.of(right))
+    }
+
+    /// Returns the permissions on a node.
+    #[must_use]
+    pub fn permissions(&self, node: &NodeId) -> Permissions {
+        let rules = self.rules.read();
+        let usual = || match node.namespace {
+            0 => Permissions::OPEN,
+            _ => Permissions::default(),
+        };
+        rules.nodes.get(node).copied().unwrap_or_else(usual)
+    }
+
+    /// Returns whether a method can be called over encrypted connections only.
+    #[must_use]
+    pub fn is_encrypted(&self, node: &NodeId) -> bool {
+        self.rules.read().encrypted.contains(node)
+    }
+
+    /// Returns the users with a role: their names, and the thumbprints of their certificates.
+    #[must_use]
+    pub fn users_of(&self, role: Role) -> Vec<(String, Option<String>)> {
+        let users = self.users.read();
+        let has_role = users.iter().filter(|(_, user)| user.roles.contains(role));
+        let identity = has_role.map(|(name, user)| match &user.credential {
+            Credential::Password(_) => (name.to_owned(), None),
+            Credential::Certificate(thumbprint) => (name.to_owned(), Some(thumbprint.clone())),
+        });
+        identity.collect()
     }
 
     /// Returns whether all admitted users may read a node.
@@ -579,6 +617,7 @@ mod tests {
         access.set_rules(Rules {
             anonymous: Anonymous::Has(Roles::of(&[Role::Operator])),
             nodes: HashMap::from([(node.clone(), engineers)]),
+            ..Rules::default()
         });
         assert!(!access.allows(&anonymous(), &node, Right::Write));
         assert!(access.allows(&anonymous(), &NodeId::new(2, 11), Right::Write));

@@ -1,0 +1,121 @@
+//! The history of the events of conditions (OPC 10000-11, 6.4.2): the last events, in memory.
+
+use std::collections::VecDeque;
+
+use opcua::nodes::{Event as _, ParsedEventFilter, TypeTree};
+use opcua::server::ContinuationPoint;
+use opcua::server::node_manager::HistoryNode;
+use opcua::types::{
+    EventFieldList, HistoryEvent, HistoryEventFieldList, ReadEventDetails, StatusCode,
+};
+
+use super::event::ConditionEvent;
+use crate::history::{Step, given, steps};
+
+/// The last events of all conditions, oldest first.
+#[derive(Default)]
+pub(super) struct PastEvents {
+    events: VecDeque<(u64, ConditionEvent)>,
+    next: u64,
+}
+
+/// The numbers of the events that follow in the next response.
+struct Rest(Vec<u64>);
+
+impl PastEvents {
+    /// Stores an event.
+    pub(super) fn keep(&mut self, event: ConditionEvent) {
+        if self.events.len() >= MOST_EVENTS {
+            self.events.pop_front();
+        }
+        self.events.push_back((self.next, event));
+        self.next += 1;
+    }
+
+    /// Returns the events of a time range, with the fields and by the filter of the request.
+    pub(super) fn read(
+        &self,
+        details: &ReadEventDetails,
+        node: &mut HistoryNode,
+        types: &dyn TypeTree,
+    ) {
+        let (_, filter) = ParsedEventFilter::new(details.filter.clone(), types);
+        let found = filter.and_then(|filter| self.found(details, node, (&filter, types)));
+        let mut found = match found {
+            Ok(found) => found,
+            Err(status) => {
+                node.set_status(status);
+                return;
+            }
+        };
+        let most = usize::try_from(details.num_values_per_node).unwrap_or(usize::MAX);
+        let most = match most {
+            0 => MOST_RETURNED,
+            most => most.min(MOST_RETURNED),
+        };
+        let rest = found.split_off(most.min(found.len()));
+        if !rest.is_empty() {
+            let rest = rest.into_iter().map(|(number, _)| number).collect();
+            let rest = ContinuationPoint::new(Box::new(Rest(rest)));
+            node.set_next_continuation_point(Some(rest));
+        }
+        node.set_status(match found.is_empty() {
+            true => StatusCode::GoodNoData,
+            false => StatusCode::Good,
+        });
+        let events = found.into_iter().map(|(_, fields)| HistoryEventFieldList {
+            event_fields: fields.event_fields,
+        });
+        node.set_result(HistoryEvent {
+            events: Some(events.collect()),
+        });
+    }
+
+    /// Returns the events of a request, or the remaining events of its continuation point, in the
+    /// requested order.
+    fn found(
+        &self,
+        details: &ReadEventDetails,
+        node: &HistoryNode,
+        (filter, types): (&ParsedEventFilter, &dyn TypeTree),
+    ) -> Result<Vec<(u64, EventFieldList)>, StatusCode> {
+        let selected = |event: &ConditionEvent| filter.evaluate(event, 0, types);
+        if let Some(point) = node.continuation_point() {
+            let rest: &Rest = point.get().ok_or(StatusCode::BadContinuationPointInvalid)?;
+            let numbers = rest.0.iter();
+            let events = numbers.filter_map(|number| {
+                let at = self.events.partition_point(|(other, _)| other < number);
+                let (found, event) = self.events.get(at)?;
+                (found == number).then(|| Some((*number, selected(event)?)))?
+            });
+            return Ok(events.collect());
+        }
+        let span = (given(details.start_time), given(details.end_time));
+        let mut all: Vec<(i64, u64, &ConditionEvent)> = self
+            .events
+            .iter()
+            .map(|(number, event)| (event.time().ticks(), *number, event))
+            .collect();
+        // The clock may have been set back.
+        all.sort_by_key(|(time, ..)| *time);
+        let times: Vec<i64> = all.iter().map(|(time, ..)| *time).collect();
+        // The number of events is that of the events that the filter selects.
+        let count = match span {
+            (Some(_), Some(_)) => 0,
+            _ if details.num_values_per_node == 0 => 0,
+            _ => u32::MAX,
+        };
+        let steps = steps(&times, span, (count, false))?;
+        let events = steps.into_iter().filter_map(|step| {
+            let Step::Value(at) = step else { return None };
+            let (_, number, event) = all.get(at)?;
+            Some((*number, selected(event)?))
+        });
+        Ok(events.collect())
+    }
+}
+
+/// Largest number of stored events.
+const MOST_EVENTS: usize = 5_000;
+/// Largest number of events in a response.
+pub(crate) const MOST_RETURNED: usize = 1_000;
