@@ -85,10 +85,7 @@ impl Store {
         {
             fs::create_dir_all(folder).map_err(|error| fault(error.to_string()))?;
         }
-        let mut builder = Database::builder();
-        builder.set_cache_size(CACHE);
-        let database = builder.create(path);
-        let database = database.map_err(|error| fault(error.to_string()))?;
+        let database = open(path).map_err(|error| fault(error.to_string()))?;
         let shapes: HashMap<u64, String> = topics
             .filter(|topic| topic.historizing)
             .map(|topic| (key(topic.topic), shape(topic)))
@@ -103,7 +100,7 @@ impl Store {
         let shared = Arc::new(Shared::default());
         let (changes, file) = (Arc::clone(&shared), path.to_owned());
         let thread = std::thread::Builder::new().name("history".to_owned());
-        let thread = thread.spawn(move || changes.write_to(&database, &file));
+        let thread = thread.spawn(move || changes.write_to(database, &file));
         let thread = thread.map_err(|error| fault(error.to_string()))?;
         let store = Self {
             shared,
@@ -222,25 +219,66 @@ impl Shared {
         (!is_last).then_some(taken)
     }
 
-    fn write_to(&self, database: &Database, file: &Path) {
-        let mut is_failing = false;
+    /// Writes the changes until the end. After an error the file is opened again, because the
+    /// database refuses all further transactions.
+    fn write_to(&self, database: Database, file: &Path) {
+        let mut database = Some(database);
+        let (mut lost, mut is_failing) = (0_u64, false);
         while let Some(changes) = self.next() {
-            let written = write(database, &changes);
-            let mut lost = changes.lost;
-            if let Err(error) = &written {
-                lost += u64::try_from(changes.values.len()).unwrap_or(u64::MAX);
-                if !is_failing {
-                    warn!(
-                        file = %file.display(), lost, %error,
-                        "cannot write the history; it continues in memory"
-                    );
+            let opened = match database.take() {
+                Some(database) => Ok(database),
+                None => open(file),
+            };
+            let written = opened
+                .map_err(redb::Error::from)
+                .and_then(|database| write(&database, &changes).map(|()| database));
+            lost = lost.saturating_add(changes.lost);
+            match written {
+                Ok(written) => {
+                    database = Some(written);
+                    if lost > 0 || is_failing {
+                        warn!(
+                            file = %file.display(), lost,
+                            "the history is written again; these values are missing in the file"
+                        );
+                    }
+                    (lost, is_failing) = (0, false);
                 }
-            } else if is_failing || lost > 0 {
-                info!(file = %file.display(), lost, "the history is written again");
+                Err(error) => {
+                    let values = u64::try_from(changes.values.len()).unwrap_or(u64::MAX);
+                    lost = lost.saturating_add(values);
+                    if !is_failing {
+                        warn!(
+                            file = %file.display(), %error,
+                            "cannot write the history; it continues in memory"
+                        );
+                    }
+                    is_failing = true;
+                    self.put_back(changes);
+                }
             }
-            is_failing = written.is_err();
         }
     }
+
+    /// Notes the removals and conditions of changes that were not written.
+    fn put_back(&self, changes: Pending) {
+        let mut pending = self.lock();
+        if pending.is_over {
+            return;
+        }
+        for (topic, floor) in changes.floors {
+            pending.floors.entry(topic).or_insert(floor);
+        }
+        for (node, bytes) in changes.conditions {
+            pending.conditions.entry(node).or_insert(bytes);
+        }
+    }
+}
+
+fn open(path: &Path) -> Result<Database, redb::DatabaseError> {
+    let mut builder = Database::builder();
+    builder.set_cache_size(CACHE);
+    builder.create(path)
 }
 
 fn write(database: &Database, changes: &Pending) -> Result<(), redb::Error> {
