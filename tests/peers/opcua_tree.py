@@ -209,7 +209,7 @@ async def of_roles(client, nodes):
     lifetime.say(
         profiles=array.Value.Value,
         monitored=await asyncio.wait_for(first.value, 10),
-        stamped=array.SourceTimestamp is not None and array.ServerTimestamp is not None,
+        stamped=array.SourceTimestamp is not None,
         rate=rate.Value.Value,
         roles=roles,
         permissions=permissions,

@@ -27,11 +27,19 @@ fn visit(cell: &Cell, clients: u32) {
     let at_once = AT_ONCE.to_string();
     let arguments = [SERVER_ENDPOINT, "--rounds", &rounds, "--clients", &at_once];
     let mut crowd = cell.asyncua_started("opcua_crowd.py", &arguments).start();
-    assert!(crowd.wait_for_end(ALL_ENDED * clients.div_ceil(60)).success());
-    eventually("the sessions of vanished clients have ended", ALL_ENDED, || {
-        let told = cell.asyncua_try("opcua_tree.py", &[SERVER_ENDPOINT, "--server"])?;
-        (told[0]["connected"] == 1).then_some(())
-    });
+    assert!(
+        crowd
+            .wait_for_end(ALL_ENDED * clients.div_ceil(60))
+            .success()
+    );
+    eventually(
+        "the sessions of vanished clients have ended",
+        ALL_ENDED,
+        || {
+            let told = cell.asyncua_try("opcua_tree.py", &[SERVER_ENDPOINT, "--server"])?;
+            (told[0]["connected"] == 1).then_some(())
+        },
+    );
 }
 
 #[test]

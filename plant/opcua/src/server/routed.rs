@@ -72,7 +72,7 @@ impl NodeManager for Routed {
     }
 
     fn owns_server_events(&self) -> bool {
-        self.inner.owns_server_events()
+        self.supplement.has_events() || self.inner.owns_server_events()
     }
 
     fn handle_new_node(&self, parent_id: &ExpandedNodeId) -> bool {

@@ -100,6 +100,11 @@ impl Supplement {
         }
     }
 
+    /// Returns true if the Server object has a history of events.
+    pub(crate) const fn has_events(&self) -> bool {
+        self.events.is_some()
+    }
+
     /// Reads the history of the events of the Server object.
     pub(crate) fn read_events(
         &self,
