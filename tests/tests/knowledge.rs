@@ -109,8 +109,14 @@ fn plant(manifests: &[(&str, String)], node_sets: &[String]) -> Knowledge {
             )
             .unwrap();
     }
+    let units = Source::new(SourceKind::File, "units");
+    knowledge
+        .replace(&units, &knowledge::units::triples(), 1)
+        .unwrap();
     let classes = format!(
-        "@prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> . <urn:example:capability:hold> rdfs:subClassOf <{GRASP}> ."
+        "@prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> . <urn:example:capability:hold> rdfs:subClassOf <{GRASP}> .
+        <urn:example:gripper> <urn:ua-bridge:plant#hasLimit> [ <http://www.w3id.org/hsu-aut/cask#hasVariableName> \"Payload\" ;
+            <urn:ua-bridge:plant#max> 5 ; <urn:ua-bridge:plant#unit> \"kg\" ] ."
     );
     knowledge
         .replace_turtle(
@@ -221,6 +227,7 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
                 ("transitions-now", "state", "Idle"),
                 ("access-of", "name", "Grasp"),
                 ("modules-with", "what", "AnaServParam"),
+                ("what-can-hold", "quantity", "300 g"),
             ]
             .map(|(question, parameter, value)| {
                 (
@@ -265,6 +272,9 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
     }
     // No process has run, and no process is known.
     let expected = [
+        "action-parameters",
+        "actions",
+        "goals",
         "objects",
         "process-parameters",
         "process-steps",

@@ -1,26 +1,30 @@
 //! The current state of the plant: the components in the graph, their skills, and the runs.
 
-use std::collections::{BTreeMap, VecDeque};
+mod parameters;
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
 use async_trait::async_trait;
 use knowledge::{
-    ComponentFacts, Knowledge, Lasting, NodeName, ParameterFacts, SkillFacts, Source, SourceKind,
-    TypeFacts,
+    Answer, ComponentFacts, Knowledge, Lasting, NodeName, ParameterFacts, SkillFacts, Source,
+    SourceKind, TypeFacts,
 };
 use serde::Serialize;
 use skills::{ClientOptions, FoundParameter, FoundSkill, Runs as RunsOfSkill, SkillClient, Value};
 use tokio::sync::watch;
 use tracing::{error, info, warn};
 
+use self::parameters::{connects, parameter, result, values};
 use crate::execute::{OpenFault, Opened, Plant};
+use crate::goal::{Action, Goal, Sequence};
 use crate::plan::Offer;
 use crate::process::{Given, Process};
 use crate::read_process::Processes;
 use crate::record::{Run, Runs};
 use crate::sources::{Finding, Sources};
-use crate::units;
 
 /// The current state of the plant.
 pub(crate) struct Cell {
@@ -32,6 +36,9 @@ pub(crate) struct Cell {
     present: Mutex<Present>,
     changed: watch::Sender<u64>,
     runs: Runs,
+    /// The runs that use components, by the IRIs of the components.
+    leases: Mutex<BTreeMap<String, String>>,
+    next_run: AtomicU64,
 }
 
 #[derive(Default)]
@@ -71,6 +78,12 @@ struct Gone {
     why: String,
 }
 
+/// A goal with a sequence of actions that reaches it.
+pub(crate) struct PlannedGoal {
+    pub(crate) process: Process,
+    pub(crate) sequence: Sequence,
+}
+
 /// A server, as discovery found it.
 #[derive(Debug, Clone)]
 pub(crate) struct Seen {
@@ -93,7 +106,31 @@ impl Cell {
             present: Mutex::default(),
             changed: watch::channel(0).0,
             runs: Runs::default(),
+            leases: Mutex::default(),
+            next_run: AtomicU64::new(1),
         }
+    }
+
+    /// Returns the number of the next run.
+    pub(crate) fn next_run(&self) -> u64 {
+        self.next_run.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Returns the newest runs.
+    pub(crate) fn runs(&self) -> Vec<Run> {
+        self.runs.all()
+    }
+
+    /// Returns the components that a run uses.
+    pub(crate) fn used_by(&self, run: &str) -> Vec<String> {
+        let leases = self.leases();
+        let own = leases.iter().filter(|(_, holder)| *holder == run);
+        own.map(|(component, _)| component.clone()).collect()
+    }
+
+    /// Gives back the components of a run.
+    pub(crate) fn give_back(&self, run: &str) {
+        self.lease(run, &BTreeSet::new());
     }
 
     pub(crate) fn knowledge(&self) -> &Knowledge {
@@ -133,12 +170,57 @@ impl Cell {
         if let Some(why) = processes.faults.get(iri) {
             return Err(format!("`{shown}` cannot run: {why}"));
         }
+        match self.goal(iri) {
+            Ok(planned) => return Ok(planned.process),
+            Err(Some(why)) => return Err(format!("the goal `{shown}` cannot be reached: {why}")),
+            Err(None) => {}
+        }
         let known = processes.all.iter().take(MOST_SHOWN);
         let known: Vec<_> = known.map(|process| process.iri.as_str()).collect();
         Err(format!(
             "`{shown}` is no process here; known are {}",
             known.join(", ")
         ))
+    }
+
+    /// Plans a goal with the actions whose capabilities have skills.
+    ///
+    /// # Errors
+    /// The reason why it cannot be reached; `None` if there is no such goal.
+    pub(crate) fn goal(&self, iri: &str) -> Result<PlannedGoal, Option<String>> {
+        let goal = Goal::read(&self.knowledge, iri)?;
+        let all = Action::read(&self.knowledge).map_err(Some)?;
+        let offers = self.offers();
+        let (actions, without): (Vec<_>, Vec<_>) = all.into_iter().partition(|action| {
+            let mut skills = offers.iter().filter(|offer| offer.is_skill);
+            skills.any(|offer| offer.closure.contains(&action.capability))
+        });
+        let sequence = goal.search(&actions).map_err(|why| {
+            let without: Vec<_> = without.iter().map(|action| action.name.as_str()).collect();
+            Some(match without.as_slice() {
+                [] => why,
+                without => format!("{why}; no skill is there for {}", without.join(", ")),
+            })
+        })?;
+        Ok(PlannedGoal {
+            process: goal.process(&sequence, &actions),
+            sequence,
+        })
+    }
+
+    /// Returns the goal whose IRI is the end of a path, and its plan as JSON.
+    pub(crate) fn goal_page(&self, escaped: &str) -> Option<serde_json::Value> {
+        let answer = self.knowledge.ask("goals", &[]).ok()?;
+        let mut goals = answer.rows.iter().map(|row| Answer::text(row, "goal"));
+        let iri = goals.find(|iri| *iri == escaped || mtp::escaped(iri) == escaped)?;
+        let page = match self.goal(iri) {
+            Ok(planned) => serde_json::json!({
+                "goal": iri, "reachable": true, "steps": planned.sequence.steps,
+                "reached": planned.sequence.reached,
+            }),
+            Err(why) => serde_json::json!({ "goal": iri, "reachable": false, "reason": why }),
+        };
+        Some(page)
     }
 
     pub(crate) fn sources(&self) -> &Arc<Sources> {
@@ -303,6 +385,20 @@ impl Cell {
         })
     }
 
+    fn leases(&self) -> MutexGuard<'_, BTreeMap<String, String>> {
+        self.leases.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns a skill of a component that is present.
+    fn found(&self, skill: &str) -> Result<FoundSkill, String> {
+        let present = self.present();
+        let mut components = present.components.values();
+        let found = components.find_map(|component| component.found.get(skill));
+        found
+            .cloned()
+            .ok_or_else(|| "its component is gone".to_owned())
+    }
+
     fn present(&self) -> MutexGuard<'_, Present> {
         self.present.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -384,12 +480,45 @@ impl Plant for Cell {
     }
 
     fn values(&self, skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
-        let present = self.present();
-        let found = present
-            .components
-            .values()
-            .find_map(|component| component.found.get(skill));
-        values(found.ok_or("its component is gone")?, given)
+        values(&self.found(skill)?, given)
+    }
+
+    fn result(&self, skill: &str, name: &str) -> Result<Option<String>, String> {
+        Ok(result(&self.found(skill)?, name)?.unit.clone())
+    }
+
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
+        let (source, target) = (self.found(from.0)?, self.found(to.0)?);
+        connects(result(&source, from.1)?, parameter(&target, to.1)?)
+    }
+
+    fn used_by_others(&self, run: &str) -> BTreeMap<String, String> {
+        let leases = self.leases();
+        let others = leases.iter().filter(|(_, holder)| *holder != run);
+        others
+            .map(|(component, holder)| (component.clone(), holder.clone()))
+            .collect()
+    }
+
+    fn lease(&self, run: &str, components: &BTreeSet<String>) -> bool {
+        let is_given_back = {
+            let mut leases = self.leases();
+            let is_free =
+                |component: &String| leases.get(component).is_none_or(|holder| holder == run);
+            if !components.iter().all(is_free) {
+                return false;
+            }
+            let before = leases.len();
+            leases.retain(|component, holder| holder != run || components.contains(component));
+            let is_given_back = leases.len() < before;
+            let taken = components.iter().map(|one| (one.clone(), run.to_owned()));
+            leases.extend(taken);
+            is_given_back
+        };
+        if is_given_back {
+            self.changed.send_modify(|changes| *changes += 1);
+        }
+        true
     }
 
     fn keep(&self, run: &Run) {
@@ -413,90 +542,6 @@ impl Plant for Cell {
     fn now(&self) -> u64 {
         now()
     }
-}
-
-/// Converts the parameters of a step to the parameters of a skill.
-///
-/// # Errors
-/// The first parameter that is unknown, missing, of another type or unit, or out of its limits.
-fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
-    for known in &found.parameters {
-        let is_given = given.iter().any(|given| given.name == known.name);
-        if known.default.is_none() && !is_given {
-            return Err(format!(
-                "{} needs the parameter {}, and the step does not give it",
-                found.name, known.name
-            ));
-        }
-    }
-    let value = |given: &Given| {
-        let parameter = found
-            .parameters
-            .iter()
-            .find(|parameter| parameter.name == given.name);
-        let parameter = parameter.ok_or_else(|| {
-            let known: Vec<_> = found
-                .parameters
-                .iter()
-                .map(|parameter| parameter.name.as_str())
-                .collect();
-            let known = if known.is_empty() {
-                "it has none".to_owned()
-            } else {
-                format!("it has {}", known.join(", "))
-            };
-            format!("{} has no parameter {}; {known}", found.name, given.name)
-        })?;
-        let wrong = |why: String| format!("{}: {why}", given.name);
-        let json = in_unit(given, parameter).map_err(wrong)?;
-        let value = parameter.shape.read_json(&json).map_err(wrong)?;
-        let numbers = if let Value::Array(_, elements) = &value {
-            elements.iter().filter_map(Value::as_f64).collect()
-        } else {
-            Vec::from_iter(value.as_f64())
-        };
-        if let Some((low, high)) = parameter.range
-            && let Some(number) = numbers
-                .into_iter()
-                .find(|number| !(low..=high).contains(number))
-        {
-            let unit = parameter.unit.as_deref().unwrap_or_default();
-            let why = format!("{number} is not from {low} to {high} {unit}");
-            return Err(wrong(why.trim_end().to_owned()));
-        }
-        Ok((given.name.clone(), value))
-    };
-    let values: Vec<(String, Value)> = given.iter().map(value).collect::<Result<_, _>>()?;
-    if let Some(workspace) = &found.workspace {
-        workspace.allows_target(values.iter())?;
-    }
-    Ok(values)
-}
-
-/// Returns the value of a parameter in the unit of the skill.
-fn in_unit(given: &Given, parameter: &FoundParameter) -> Result<serde_json::Value, String> {
-    let Some(from) = given.unit.as_deref() else {
-        return Ok(given.value.clone());
-    };
-    let Some(to) = parameter.unit.as_deref() else {
-        return Err(format!("the skill gives no unit, and {from} is given"));
-    };
-    if from == to {
-        return Ok(given.value.clone());
-    }
-    let one = |value: &serde_json::Value| {
-        let number = value.as_f64();
-        let number =
-            number.ok_or_else(|| format!("`{value}` with the unit {from} is no number"))?;
-        let converted = units::convert(number, from, to);
-        converted
-            .map(Into::into)
-            .ok_or_else(|| format!("its unit is {to}, and {from} cannot be converted to it"))
-    };
-    if let serde_json::Value::Array(all) = &given.value {
-        return all.iter().map(one).collect();
-    }
-    one(&given.value)
 }
 
 struct OpenedSkills {

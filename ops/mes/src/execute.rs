@@ -1,22 +1,26 @@
 //! Executes a process: plans it with the available skills, runs the plan, and plans again when a
-//! component is lost.
+//! step fails or a component is lost. Completed steps are not repeated; they are compensated if the
+//! run fails.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+mod compensate;
+mod watched;
+
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::frame::Frame;
-use skills::{
-    GripPoint, Outcome, PartEnd, PickAndPlace, Runs, SkillFault, Teller, Value, run_part,
-};
+use skills::{PartEnd, PickAndPlace, Runs, SkillFault, Teller, Value, run_part};
 use tokio::sync::watch;
-use tokio::time::Instant;
 use tracing::{info, warn};
 
-use crate::plan::{Fallen, Offer, Plan, plan};
-use crate::process::{Given, Job, Process, Role};
-use crate::record::{How, Planned, Ran, Run, Values, recorded};
+use crate::plan::{Facts, Fallen, Offer, Plan, Situation, plan};
+use crate::process::{Given, Job, Process, Role, Step};
+use crate::record::{How, Planned, Run};
+
+use compensate::Done;
+use watched::Watched;
 
 /// The plant as the execution of a process needs it.
 #[async_trait]
@@ -33,6 +37,22 @@ pub(crate) trait Plant: Send + Sync {
 
     /// Converts the parameters of a step to the parameters of a skill.
     fn values(&self, skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String>;
+
+    /// Returns the unit of a result of a skill, if it has one.
+    ///
+    /// # Errors
+    /// The reason why the skill does not have the result.
+    fn result(&self, skill: &str, name: &str) -> Result<Option<String>, String>;
+
+    /// Checks that a result of a skill can be a parameter of another skill.
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String>;
+
+    /// Returns the components that other runs use, with these runs.
+    fn used_by_others(&self, run: &str) -> BTreeMap<String, String>;
+
+    /// Gives a run the use of these components, and takes it from all others that it had. Returns
+    /// whether it has them: all of them, or what it had before if another run uses one of them.
+    fn lease(&self, run: &str, components: &BTreeSet<String>) -> bool;
 
     /// Stores the state of a run.
     fn keep(&self, run: &Run);
@@ -116,7 +136,9 @@ struct Whole(Arc<Log>);
 
 impl Drop for Whole {
     fn drop(&mut self) {
-        if self.0.run().ended_ms.is_some() {
+        let run = self.0.run();
+        if run.ended_ms.is_some() {
+            self.give_back();
             return;
         }
         self.0.change(|kept, now| {
@@ -129,6 +151,18 @@ impl Drop for Whole {
             kept.run.outcome = ended_badly(&kept.run);
             kept.run.reason = Some(why.to_owned());
         });
+        self.give_back();
+    }
+}
+
+impl Whole {
+    /// Gives back the components of the run, unless its outcome is unknown: a machine may still
+    /// move.
+    fn give_back(&self) {
+        let run = self.0.run();
+        if !run.is_unknown() {
+            self.0.plant.lease(&run.run, &BTreeSet::new());
+        }
     }
 }
 
@@ -154,15 +188,27 @@ fn tell(run: &Run) {
     }
 }
 
-/// Plans a process without running it.
+/// Plans a process without running it, as if no other process was running.
 pub(crate) fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
-    plan_now(plant, process, &plant.offers(), &[])
+    let situation = Situation::default();
+    plan(process, &plant.offers(), situation, &OfPlant(plant))
 }
 
-fn plan_now(plant: &dyn Plant, process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Plan {
-    plan(process, offers, fallen, &|offer, step| {
-        plant.values(&offer.skill, &step.parameters).map(drop)
-    })
+/// The facts about skills that the plant knows.
+struct OfPlant<'a>(&'a dyn Plant);
+
+impl Facts for OfPlant<'_> {
+    fn takes(&self, offer: &Offer, step: &Step) -> Result<(), String> {
+        self.0.values(&offer.skill, &step.parameters).map(drop)
+    }
+
+    fn gives(&self, offer: &Offer, result: &str) -> Result<(), String> {
+        self.0.result(&offer.skill, result).map(drop)
+    }
+
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
+        self.0.connects(from, to)
+    }
 }
 
 struct Execution<'a> {
@@ -181,25 +227,35 @@ enum Ended {
     Over(String),
 }
 
+/// The skills that a plan runs.
+struct Chosen {
+    /// The offers by their roles, in the order of the steps that are not done.
+    open: Vec<(Role, Offer)>,
+    /// The offers of compensations, by the numbers of the steps.
+    undo: BTreeMap<usize, Offer>,
+}
+
 impl Execution<'_> {
+    /// Runs the process. If it fails, its completed steps are compensated.
     async fn run(&self) -> Result<(), String> {
+        let mut done = Vec::new();
+        let ended = self.forward(&mut done).await;
+        match ended {
+            Ok(()) => Ok(()),
+            Err(why) => Err(self.compensated(why, &done).await),
+        }
+    }
+
+    /// Runs plans until all steps are done.
+    async fn forward(&self, done: &mut Vec<Done>) -> Result<(), String> {
         let mut last = String::new();
         for number in 1..=MOST_PLANS {
-            let (plan, offers) = self.planned(&last).await?;
+            let (plan, chosen) = self.planned(&last, done).await?;
             self.log.change(|kept, now| {
                 kept.run.waits_for = None;
-                kept.run.plans.push(Planned {
-                    number,
-                    at_ms: now,
-                    ended_ms: None,
-                    plan,
-                    ran: Vec::new(),
-                    outcome: How::Running,
-                    reason: None,
-                    retreated: None,
-                });
+                kept.run.plans.push(Planned::begins(number, now, plan));
             });
-            let ended = self.carry_out(&offers).await;
+            let ended = self.carry_out(&chosen, done).await;
             let (outcome, reason) = match &ended {
                 Ended::Done => (How::Done, None),
                 Ended::Broken(why) | Ended::Over(why) => (How::Failed, Some(why.clone())),
@@ -223,36 +279,43 @@ impl Execution<'_> {
         Err(format!("{MOST_PLANS} plans broke; the last: {last}"))
     }
 
-    /// Waits for a complete plan, and returns it with the chosen offers by their roles.
-    async fn planned(&self, last: &str) -> Result<(Plan, Vec<(Role, Offer)>), String> {
+    /// Waits for a complete plan of the steps that are not done, and returns it with the chosen
+    /// offers. The run has the use of their components then.
+    async fn planned(&self, last: &str, done: &[Done]) -> Result<(Plan, Chosen), String> {
+        let run = self.log.run().run;
+        let kept = compensate::kept(self.process, done);
+        let after = if last.is_empty() {
+            String::new()
+        } else {
+            format!("{last}; ")
+        };
         let mut changes = self.plant.changes();
         let wait = tokio::time::sleep(self.process.wait);
         tokio::pin!(wait);
         loop {
             changes.mark_unchanged();
             let offers = self.plant.offers();
-            let plan = plan_now(self.plant, self.process, &offers, &self.log.fallen());
+            let (fallen, used) = (self.log.fallen(), self.plant.used_by_others(&run));
+            let situation = Situation {
+                fallen: &fallen,
+                kept: &kept,
+                used: Some(&used),
+            };
+            let plan = plan(self.process, &offers, situation, &OfPlant(self.plant));
             if plan.is_complete() {
-                let mut chosen: Vec<(Role, Offer)> = Vec::new();
-                for role in self
-                    .process
-                    .steps
-                    .iter()
-                    .flat_map(|step| &step.needs)
-                    .map(|need| need.role)
-                {
-                    let offer = plan
-                        .chosen(role)
-                        .and_then(|skill| offers.iter().find(|offer| offer.skill == skill));
-                    if let Some(offer) =
-                        offer.filter(|_| chosen.iter().all(|(known, _)| *known != role))
-                    {
-                        chosen.push((role, offer.clone()));
-                    }
+                let chosen = self.chosen(&plan, &offers, done.len());
+                let all = chosen.open.iter().map(|(_, offer)| offer);
+                let all = all.chain(chosen.undo.values());
+                let all = all.chain(kept.iter().map(|kept| &kept.offer));
+                let components = all.map(|offer| offer.component.clone()).collect();
+                if self.plant.lease(&run, &components) {
+                    return Ok((plan, chosen));
                 }
-                return Ok((plan, chosen));
             }
             let missing = plan.missing();
+            if plan.is_hopeless() {
+                return Err(format!("{after}{missing}"));
+            }
             self.log
                 .change(|kept, _| kept.run.waits_for = Some(missing.clone()));
             self.teller.step("Wait").await;
@@ -263,7 +326,6 @@ impl Execution<'_> {
                     }
                 }
                 () = &mut wait => {
-                    let after = if last.is_empty() { String::new() } else { format!("{last}; ") };
                     return Err(format!("{after}nobody came in {} s: {missing}", self.process.wait.as_secs_f64()));
                 }
                 () = self.teller.stopped() => return Err("stopped".to_owned()),
@@ -271,9 +333,50 @@ impl Execution<'_> {
         }
     }
 
-    async fn carry_out(&self, chosen: &[(Role, Offer)]) -> Ended {
-        let offers: Vec<Offer> = chosen.iter().map(|(_, offer)| offer.clone()).collect();
-        let opened = match self.plant.open(&offers).await {
+    /// Returns the chosen offers of a plan, without those of the first steps, which are done.
+    fn chosen(&self, plan: &Plan, offers: &[Offer], done: usize) -> Chosen {
+        let of = |role: Role| {
+            let skill = plan.chosen(role)?;
+            offers.iter().find(|offer| offer.skill == skill).cloned()
+        };
+        let mut open: Vec<(Role, Offer)> = Vec::new();
+        let left = self.process.steps.iter().skip(done);
+        for role in left.flat_map(|step| &step.needs).map(|need| need.role) {
+            if open.iter().all(|(known, _)| *known != role) {
+                open.extend(of(role).map(|offer| (role, offer)));
+            }
+        }
+        let undo = (done..self.process.steps.len()).filter_map(|number| {
+            let role = Role::Alone(self.process.compensation_of(number));
+            Some((number, of(role)?))
+        });
+        Chosen {
+            open,
+            undo: undo.collect(),
+        }
+    }
+
+    /// Opens skills to run them. Their runs are recorded in the log.
+    async fn open(
+        &self,
+        offers: &[Offer],
+    ) -> Result<(Box<dyn Opened>, Vec<Arc<dyn Runs>>), OpenFault> {
+        let opened = self.plant.open(offers).await?;
+        let watched = opened
+            .skills()
+            .into_iter()
+            .zip(offers)
+            .map(|(skill, offer)| {
+                let watched = Watched::new(skill, offer, self.log, self.process);
+                Arc::new(watched) as Arc<dyn Runs>
+            });
+        let watched = watched.collect();
+        Ok((opened, watched))
+    }
+
+    async fn carry_out(&self, chosen: &Chosen, done: &mut Vec<Done>) -> Ended {
+        let offers: Vec<Offer> = chosen.open.iter().map(|(_, offer)| offer.clone()).collect();
+        let (opened, skills) = match self.open(&offers).await {
             Ok(opened) => opened,
             Err(fault) => {
                 let since_ms = offers
@@ -293,33 +396,15 @@ impl Execution<'_> {
                 ));
             }
         };
-        let watched = opened
-            .skills()
-            .into_iter()
-            .zip(&offers)
-            .map(|(skill, offer)| {
-                let watched = Watched {
-                    inner: skill,
-                    offer: offer.clone(),
-                    log: Arc::clone(self.log),
-                    process: self.process.clone(),
-                    is_halted: AtomicBool::new(false),
-                };
-                Arc::new(watched) as Arc<dyn Runs>
-            });
-        let roles: Vec<(Role, Arc<dyn Runs>)> =
-            chosen.iter().map(|(role, _)| *role).zip(watched).collect();
         let ended = match &self.process.work {
-            Job::PickAndPlace(job) => self.pick_and_place(job, &roles).await,
-            Job::Sequence => self.sequence(chosen, &roles).await,
+            Job::PickAndPlace(job) => {
+                let roles = chosen.open.iter().map(|(role, _)| *role);
+                let roles: Vec<_> = roles.zip(skills).collect();
+                self.pick_and_place(job, &roles).await
+            }
+            Job::Sequence => self.sequence(chosen, &skills, done).await,
         };
-        drop(roles);
-        // A lost component does not respond to the close.
-        if tokio::time::timeout(CLOSE, opened.close()).await.is_err() {
-            warn!(
-                "the components of a plan were not released in time; they stay reserved until their sessions end"
-            );
-        }
+        close(opened).await;
         ended
     }
 
@@ -367,45 +452,111 @@ impl Execution<'_> {
         }
     }
 
-    async fn sequence(&self, chosen: &[(Role, Offer)], roles: &[(Role, Arc<dyn Runs>)]) -> Ended {
-        for (((_, skill), (_, offer)), step) in roles.iter().zip(chosen).zip(&self.process.steps) {
-            self.log.step(&step.name);
+    async fn sequence(
+        &self,
+        chosen: &Chosen,
+        skills: &[Arc<dyn Runs>],
+        done: &mut Vec<Done>,
+    ) -> Ended {
+        for ((role, offer), skill) in chosen.open.iter().zip(skills) {
+            let number = done.len();
+            let Some(step) = self
+                .process
+                .steps
+                .get(number)
+                .filter(|_| *role == Role::Alone(number))
+            else {
+                return Ended::Over("the plan has another step than the process".to_owned());
+            };
             self.teller.step("Step").await;
-            let values = match self.plant.values(&offer.skill, &step.parameters) {
-                Ok(values) => values,
-                Err(why) => return Ended::Over(format!("{}: {why}", step.name)),
-            };
-            let within = self.process.within;
-            let part = run_part(&**skill, values, within, self, self.teller.stopped());
-            let outcome = match part.await {
-                PartEnd::Ended(outcome) => outcome,
-                PartEnd::Interrupted { halted: Ok(()), .. } => {
-                    return Ended::Over("stopped".to_owned());
-                }
-                PartEnd::Interrupted {
-                    halted: Err(fault), ..
-                } => {
-                    let name = skill.name();
-                    return Ended::Over(format!("stopped, but {name} may go on: {fault}"));
-                }
-            };
-            // The run of a lost component may go on; another component must not repeat it.
-            let is_lost = matches!(outcome, Err(SkillFault::Lost(_)));
-            let why = match outcome {
-                Ok(outcome) if outcome.succeeded => continue,
-                Ok(outcome) => outcome.message,
-                Err(fault) => fault.to_string(),
-            };
-            // Another plan would repeat the completed steps.
-            let why = format!("{}: {} {why}", step.name, skill.name());
-            let is_first = self.process.steps.first() == Some(step);
-            return if is_first && !is_lost {
-                Ended::Broken(why)
-            } else {
-                Ended::Over(why)
-            };
+            let before = self.log.ran();
+            match self.one(step, (offer, &**skill), done).await {
+                StepEnd::Done(results) => done.push(Done {
+                    number,
+                    offer: offer.clone(),
+                    undo: chosen.undo.get(&number).cloned(),
+                    results,
+                }),
+                StepEnd::Stopped(why) | StepEnd::Unresolved(why) => return Ended::Over(why),
+                // The run of a lost component may go on; another component must not repeat it.
+                StepEnd::Lost(why) if self.log.ran() > before => return Ended::Over(why),
+                StepEnd::Lost(why) | StepEnd::Failed(why) => return Ended::Broken(why),
+            }
         }
         Ended::Done
+    }
+
+    /// Runs the skill of a step or of a compensation to its end.
+    async fn one(
+        &self,
+        step: &Step,
+        (offer, skill): (&Offer, &dyn Runs),
+        done: &[Done],
+    ) -> StepEnd {
+        self.log.step(&step.name);
+        let given = match compensate::resolved(self.plant, step, done) {
+            Ok(given) => given,
+            Err(why) => return StepEnd::Unresolved(format!("{}: {why}", step.name)),
+        };
+        let values = match self.plant.values(&offer.skill, &given) {
+            Ok(values) => values,
+            Err(why) => {
+                self.log.fell(Fallen {
+                    component: offer.component.clone(),
+                    since_ms: offer.since_ms,
+                    skill: Some(offer.skill.clone()),
+                    why: format!("it does not take the parameters: {why}"),
+                });
+                return StepEnd::Failed(format!("{}: {why}", step.name));
+            }
+        };
+        let within = self.process.within;
+        let part = run_part(skill, values, within, self, self.teller.stopped());
+        let outcome = match part.await {
+            PartEnd::Ended(outcome) => outcome,
+            PartEnd::Interrupted { halted: Ok(()), .. } => {
+                return StepEnd::Stopped("stopped".to_owned());
+            }
+            PartEnd::Interrupted {
+                halted: Err(fault), ..
+            } => {
+                let name = skill.name();
+                return StepEnd::Stopped(format!("stopped, but {name} may go on: {fault}"));
+            }
+        };
+        let is_lost = matches!(outcome, Err(SkillFault::Lost(_)));
+        let why = match outcome {
+            Ok(outcome) if outcome.succeeded => return StepEnd::Done(outcome.results),
+            Ok(outcome) => outcome.message,
+            Err(fault) => fault.to_string(),
+        };
+        let why = format!("{}: {} {why}", step.name, skill.name());
+        match is_lost {
+            true => StepEnd::Lost(why),
+            false => StepEnd::Failed(why),
+        }
+    }
+}
+
+/// The end of a step.
+enum StepEnd {
+    /// With its results.
+    Done(Vec<(String, Value)>),
+    /// The caller stopped the run.
+    Stopped(String),
+    /// An earlier step did not return a result.
+    Unresolved(String),
+    Failed(String),
+    /// Its component is lost.
+    Lost(String),
+}
+
+/// Releases the leases of components. A lost component does not respond to the close.
+async fn close(opened: Box<dyn Opened>) {
+    if tokio::time::timeout(CLOSE, opened.close()).await.is_err() {
+        warn!(
+            "the components of a plan were not released in time; they stay reserved until their sessions end"
+        );
     }
 }
 
@@ -470,6 +621,12 @@ impl Log {
             .clone()
     }
 
+    /// Returns the number of skill runs in the current plan.
+    fn ran(&self) -> usize {
+        let kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        kept.run.plans.last().map_or(0, |plan| plan.ran.len())
+    }
+
     fn step(&self, step: &str) {
         step.clone_into(
             &mut self
@@ -490,160 +647,6 @@ impl Log {
             }
         });
     }
-}
-
-/// A skill that records its runs in the log.
-struct Watched {
-    inner: Arc<dyn Runs>,
-    offer: Offer,
-    process: Process,
-    log: Arc<Log>,
-    /// Whether the run was halted because of another skill, which says nothing against this one.
-    is_halted: AtomicBool,
-}
-
-impl Watched {
-    fn begins(&self, parameters: Values) {
-        self.log.change(|kept, now| {
-            let step = kept.step.clone();
-            let of = of_step(&self.process, &step);
-            if let Some(plan) = kept.run.plan() {
-                plan.ran.push(Ran {
-                    step,
-                    of,
-                    skill: self.offer.skill.clone(),
-                    component: self.offer.component.clone(),
-                    parameters,
-                    results: Values::new(),
-                    started_ms: now,
-                    ended_ms: None,
-                    outcome: How::Running,
-                    reason: None,
-                });
-            }
-        });
-    }
-
-    fn ends(&self, outcome: How, reason: Option<String>, results: Values) {
-        self.log.change(|kept, now| {
-            let is_this = |ran: &&mut Ran| ran.is_running() && ran.skill == self.offer.skill;
-            if let Some(ran) = kept
-                .run
-                .plan()
-                .and_then(|plan| plan.ran.iter_mut().rev().find(is_this))
-            {
-                ran.ended_ms = (outcome != How::Unknown).then_some(now);
-                ran.outcome = outcome;
-                ran.reason = reason;
-                ran.results = results;
-            }
-        });
-    }
-
-    /// Records that the end of the run is unknown.
-    fn unknown(&self, why: &str) {
-        self.ends(How::Unknown, Some(why.to_owned()), Values::new());
-    }
-
-    fn fell(&self, is_lost: bool, why: &str) {
-        let skill = (!is_lost).then(|| self.offer.skill.clone());
-        let why = if is_lost {
-            format!("it was lost in this run: {why}")
-        } else {
-            format!("it failed in this run: {why}")
-        };
-        self.log.fell(Fallen {
-            component: self.offer.component.clone(),
-            since_ms: self.offer.since_ms,
-            skill,
-            why,
-        });
-    }
-}
-
-#[async_trait]
-impl Runs for Watched {
-    fn grip_point(&self) -> Option<GripPoint> {
-        self.inner.grip_point()
-    }
-
-    fn name(&self) -> String {
-        self.inner.name()
-    }
-
-    async fn run(
-        &self,
-        parameters: Vec<(String, Value)>,
-        within: Duration,
-    ) -> Result<Outcome, SkillFault> {
-        self.is_halted.store(false, Ordering::Relaxed);
-        self.begins(recorded(&parameters));
-        let began = Instant::now();
-        let outcome = self.inner.run(parameters, within).await;
-        match &outcome {
-            Ok(outcome) if outcome.succeeded => {
-                self.ends(How::Done, None, recorded(&outcome.results));
-            }
-            Ok(outcome) if outcome.unknown => self.unknown(&outcome.message),
-            Ok(_) if self.is_halted.load(Ordering::Relaxed) => {
-                self.ends(How::Stopped, None, Values::new());
-            }
-            Ok(outcome) => {
-                self.fell(false, &outcome.message);
-                self.ends(How::Failed, Some(outcome.message.clone()), Values::new());
-            }
-            Err(SkillFault::Lost(why)) => self.fell(true, why),
-            Err(fault) if may_go_on(fault, began.elapsed() >= within) => {
-                self.unknown(&fault.to_string());
-            }
-            Err(fault) => {
-                self.fell(false, &fault.to_string());
-                self.ends(How::Failed, Some(fault.to_string()), Values::new());
-            }
-        }
-        outcome
-    }
-
-    async fn halt(&self) -> Result<(), SkillFault> {
-        self.is_halted.store(true, Ordering::Relaxed);
-        self.inner.halt().await
-    }
-
-    async fn lost(&self) -> String {
-        let why = self.inner.lost().await;
-        self.fell(true, &why);
-        why
-    }
-}
-
-/// Returns whether a run may go on after a fault. `is_late` tells that the time of the run was
-/// over, when a refusal can be that of its Halt.
-const fn may_go_on(fault: &SkillFault, is_late: bool) -> bool {
-    match fault {
-        // The run may have been started, and its end was not seen.
-        SkillFault::NotHalted(_) | SkillFault::Lost(_) | SkillFault::Unexpected(_) => true,
-        SkillFault::Refused { .. } => is_late,
-        // The Halt was confirmed.
-        SkillFault::TimedOut(_) => false,
-    }
-}
-
-/// Returns the step of the process that contains a step of the composite: picking, up to the lift
-/// of the object, or placing.
-fn of_step(process: &Process, step: &str) -> String {
-    let is_picking = step.starts_with("MovePick") || matches!(step, "Init" | "Grasp");
-    let of = match (&process.work, process.steps.as_slice()) {
-        (Job::PickAndPlace(_), [picks, .., places]) => {
-            if is_picking {
-                Some(picks)
-            } else {
-                Some(places)
-            }
-        }
-        (Job::PickAndPlace(_), [all]) => Some(all),
-        (Job::PickAndPlace(_), []) | (Job::Sequence, _) => None,
-    };
-    of.map_or_else(|| step.to_owned(), |of| of.name.clone())
 }
 
 /// Maximum number of plans of a run.

@@ -1,7 +1,6 @@
 //! ExecuteProcess, the skill of the MES.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -14,7 +13,21 @@ use crate::record::How;
 /// Plans and runs the process of its parameter.
 pub(crate) struct ExecuteProcess {
     pub(crate) cell: Arc<Cell>,
-    pub(crate) runs: AtomicU64,
+    /// The last run with an unknown outcome. The skill was reset after it.
+    unknown: Mutex<Option<String>>,
+}
+
+impl ExecuteProcess {
+    pub(crate) fn new(cell: Arc<Cell>) -> Self {
+        Self {
+            cell,
+            unknown: Mutex::default(),
+        }
+    }
+
+    fn unknown(&self) -> MutexGuard<'_, Option<String>> {
+        self.unknown.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 #[async_trait]
@@ -64,8 +77,16 @@ impl Driver for ExecuteProcess {
             );
         }
         let plant: Arc<dyn Plant> = Arc::clone(&self.cell) as Arc<dyn Plant>;
-        let number = self.runs.fetch_add(1, Ordering::Relaxed);
+        let number = self.cell.next_run();
+        // The Reset that the skill needed confirms that the machines of the last run stand still.
+        let last = self.unknown().take();
+        if let Some(last) = last {
+            self.cell.give_back(&last);
+        }
         let run = execute(&plant, &process, number, &Telling(&work)).await;
+        if run.outcome == How::Unknown {
+            *self.unknown() = Some(run.run.clone());
+        }
         match (run.outcome, run.reason) {
             (How::Done, _) => report(
                 &serde_json::json!({ "run": run.run, "process": iri, "plans": run.plans.len(), "outcome": "done" }),

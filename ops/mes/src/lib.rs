@@ -11,12 +11,16 @@
 //! - `cell`: the current state of the plant
 //! - `follow`: from discovery to the graph
 //! - `sources`: from files to the graph, while the program runs
+//! - `goal`: the search for a sequence that reaches a goal
+//! - `jobs`: processes that clients start, several at a time
 //! - `execution_skill` and `locate_skill`: the skills of the MES
 
 mod cell;
 mod execute;
 mod execution_skill;
 mod follow;
+mod goal;
+mod jobs;
 mod live;
 mod locate_skill;
 mod plan;
@@ -25,13 +29,11 @@ mod read_process;
 mod record;
 mod settings;
 mod sources;
-mod units;
 
 use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -47,12 +49,14 @@ use skills::{
     ClientOptions, Component, Driver, DriverSetup, Lds, LocalRun, Owner, Runs as _, Security,
     Skill, SkillSetup, TypeName, Value,
 };
+use tokio::runtime::Handle;
 use tokio::signal::unix::{SignalKind, signal};
 use tracing::{error, info, warn};
 use ua_component::{ComponentPort, Options, made};
 
 use crate::cell::Cell;
 use crate::execution_skill::ExecuteProcess;
+use crate::jobs::Jobs;
 use crate::locate_skill::LocateObject;
 use crate::settings::{Connect, Settings};
 use crate::sources::Sources;
@@ -159,10 +163,7 @@ impl UaMes {
                 format!("--run {iri}: {} has no such process", self.mes.display()),
             ));
         }
-        let driver = ExecuteProcess {
-            cell: Arc::clone(&cell),
-            runs: AtomicU64::new(1),
-        };
+        let driver = ExecuteProcess::new(Arc::clone(&cell));
         let locator = LocateObject {
             knowledge: Arc::clone(&knowledge),
         };
@@ -212,24 +213,12 @@ impl UaMes {
             )
         })?;
         let access = Arc::new(access);
-        let may: May = Arc::new(move |user| {
-            let access = Arc::clone(&access);
-            Box::pin(async move {
-                access.look();
-                match user {
-                    Some((name, password)) => {
-                        let roles = access.roles_by_password(&name, &password, "SPARQL").await;
-                        roles.contains(Role::Engineer)
-                    }
-                    // Without any user, programs of this host may write.
-                    None => access.roles_of_anonymous().contains(Role::Operator),
-                }
-            })
-        });
         Ok(Writes {
             now: cell::now,
-            may,
+            may: has(&access, Role::Engineer),
+            may_run: has(&access, Role::Operator),
             files: Arc::clone(ready.cell.sources()) as Arc<dyn SourceFiles>,
+            jobs: Arc::new(Jobs::new(Arc::clone(&ready.cell), Handle::current())),
         })
     }
 
@@ -456,6 +445,24 @@ impl Program for UaMes {
     }
 }
 
+/// Returns the check that a user has a role. Without any user, programs of this host have it.
+fn has(access: &Arc<Access>, role: Role) -> May {
+    let access = Arc::clone(access);
+    Arc::new(move |user| {
+        let access = Arc::clone(&access);
+        Box::pin(async move {
+            access.look();
+            match user {
+                Some((name, password)) => {
+                    let roles = access.roles_by_password(&name, &password, "SPARQL").await;
+                    roles.contains(role) || roles.contains(Role::Engineer)
+                }
+                None => access.roles_of_anonymous().contains(Role::Operator),
+            }
+        })
+    })
+}
+
 /// Returns the MES as a component of the plant.
 fn component(settings: &Settings, driver: ExecuteProcess, locator: LocateObject) -> Component {
     let skill = |name: &str, driver: Arc<dyn Driver>| SkillSetup {
@@ -505,21 +512,26 @@ fn read_settings(file: &Path) -> Result<Settings, String> {
     Settings::from_yaml(&text, folder).map_err(|findings| findings.render(&name, &text))
 }
 
-/// Returns the pages `/status` and `/plan/IRI`. The latter shows the plan that would be run, with
-/// its reasons.
+/// Returns the pages `/status`, `/plan/IRI` and `/goal/IRI`. `/plan/` shows the plan that would be
+/// run, with its reasons; `/goal/` the sequence that reaches a goal, with its proof.
 fn page(cell: &Arc<Cell>) -> knowledge::Page {
     let cell = Arc::clone(cell);
     Arc::new(move |path| {
         if path == "/status" {
             return Some(cell.status().to_string());
         }
+        if let Some(iri) = path.strip_prefix("/goal/") {
+            return cell.goal_page(iri).map(|page| page.to_string());
+        }
         let iri = path.strip_prefix("/plan/")?;
         let processes = cell.processes();
-        let process = processes
-            .all
-            .iter()
-            .find(|process| process.iri == iri || mtp::escaped(&process.iri) == iri)?;
-        let plan = execute::dry_run(&*cell, process);
+        let mut known = processes.all.iter();
+        let known = known.find(|process| process.iri == iri || mtp::escaped(&process.iri) == iri);
+        let process = match known {
+            Some(process) => process.clone(),
+            None => cell.goal(iri).ok()?.process,
+        };
+        let plan = execute::dry_run(&*cell, &process);
         Some(serde_json::json!({ "process": process.iri, "complete": plan.is_complete(), "missing": plan.missing(), "plan": plan }).to_string())
     })
 }

@@ -1,6 +1,8 @@
 //! Assigns available skills to the needs of a process, with reasons. Planning is a pure function:
 //! its input is the result of a query, its output is a plan.
 
+mod judging;
+
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,6 +11,8 @@ use serde::Serialize;
 use skills::TypeName;
 
 use crate::process::{By, Group, Job, Need, Process, Role, Step};
+
+use judging::Judging;
 
 /// An available skill, as a row of the query `candidates`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -70,6 +74,31 @@ pub(crate) struct PlannedNeed {
     pub(crate) candidates: Vec<Candidate>,
     #[serde(skip)]
     role_is: Role,
+    /// Whether the component of a completed step has to do it.
+    #[serde(skip)]
+    is_bound: bool,
+}
+
+impl PlannedNeed {
+    /// Creates a need whose skill is chosen without other candidates.
+    fn chosen(need: &Need, offer: &Offer, why: &str) -> Self {
+        Self {
+            role: need.role.name(),
+            capability: need.capability.clone(),
+            skill_type: need.skill_type.as_ref().map(ToString::to_string),
+            chosen: Some(offer.skill.clone()),
+            candidates: vec![Candidate {
+                skill: offer.skill.clone(),
+                name: offer.name.clone(),
+                component: offer.component.clone(),
+                component_name: offer.component_name.clone(),
+                chosen: true,
+                why: why.to_owned(),
+            }],
+            role_is: need.role,
+            is_bound: true,
+        }
+    }
 }
 
 /// A skill that was considered.
@@ -108,36 +137,68 @@ impl Offer {
     }
 }
 
-/// Returns the reason why an offer cannot take the parameters of a step.
-pub(crate) type Check<'a> = dyn Fn(&Offer, &Step) -> Result<(), String> + 'a;
+/// A step that is done, or its compensation, with the skill that was chosen for it. A later plan
+/// keeps the choice.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Kept {
+    /// The number of the role.
+    pub(crate) number: usize,
+    pub(crate) offer: Offer,
+}
 
-/// Plans a process with the available skills, except failed skills and lost components. `check`
-/// judges the parameters of the steps.
+/// The facts about a run that its next plan has to respect.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Situation<'a> {
+    /// Failed skills and lost components.
+    pub(crate) fallen: &'a [Fallen],
+    /// The steps that are done.
+    pub(crate) kept: &'a [Kept],
+    /// The components that other runs use, with these runs.
+    pub(crate) used: Option<&'a BTreeMap<String, String>>,
+}
+
+/// The facts about skills that a plan needs. Each check returns the reason why it fails.
+pub(crate) trait Facts {
+    /// Checks that an offer takes the parameters of a step.
+    fn takes(&self, offer: &Offer, step: &Step) -> Result<(), String>;
+
+    /// Checks that an offer has the result of a name.
+    fn gives(&self, offer: &Offer, result: &str) -> Result<(), String>;
+
+    /// Checks that a result of a skill, given by its IRI, can be a parameter of another skill.
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String>;
+}
+
+/// Plans a process with the available skills.
 pub(crate) fn plan(
     process: &Process,
     offers: &[Offer],
-    fallen: &[Fallen],
-    check: &Check<'_>,
+    situation: Situation<'_>,
+    facts: &dyn Facts,
 ) -> Plan {
     let mut roles: BTreeMap<Role, Vec<&Need>> = BTreeMap::new();
-    for need in process.steps.iter().flat_map(|step| &step.needs) {
+    for need in process.numbered().flat_map(|(_, step)| &step.needs) {
         roles.entry(need.role).or_default().push(need);
     }
-    let mut judging = Judging {
-        process,
-        fallen,
-        check,
-        tools: BTreeMap::new(),
-    };
-    judging.tools = judging.attached_tools(offers);
-    let fitting: BTreeMap<Role, Vec<&Offer>> = roles
+    let mut judging = Judging::new(process, situation, facts);
+    judging.require_tools(offers);
+    let mut fitting: BTreeMap<Role, Vec<&Offer>> = roles
         .iter()
         .map(|(role, needs)| {
-            let fits = |offer: &&Offer| needs.iter().all(|need| judging.judge(need, offer).is_ok());
+            if let Some(kept) = judging.kept(*role) {
+                return (*role, vec![kept]);
+            }
+            let fits = |offer: &&Offer| needs.iter().all(|need| judging.fits(need, offer));
             (*role, offers.iter().filter(fits).collect())
         })
         .collect();
     let groups = bind(process, &roles, &fitting);
+    judging.bind(&groups);
+    for (role, fitting) in &mut fitting {
+        if judging.kept(*role).is_none() {
+            fitting.retain(|offer| judging.is_allowed(*role, offer));
+        }
+    }
     let all: BTreeSet<Group> = groups.values().copied().collect();
     let teams: BTreeMap<Group, Team<'_>> = all
         .into_iter()
@@ -151,7 +212,7 @@ pub(crate) fn plan(
         })
         .collect();
     let team = |need: &Need| groups.get(&need.role).and_then(|group| teams.get(group));
-    let steps = process.steps.iter().map(|step| PlannedStep {
+    let steps = process.numbered().map(|(_, step)| PlannedStep {
         step: step.name.clone(),
         needs: step
             .needs
@@ -159,9 +220,11 @@ pub(crate) fn plan(
             .map(|need| judging.planned(need, offers, team(need)))
             .collect(),
     });
-    Plan {
+    let mut plan = Plan {
         steps: steps.collect(),
-    }
+    };
+    judging.connect(&mut plan);
+    plan
 }
 
 /// Returns the group of each role: the roles of a group are filled by one component. In a sequence
@@ -218,7 +281,7 @@ fn bind(
             }
         }
     }
-    for (number, step) in process.steps.iter().enumerate() {
+    for (number, step) in process.numbered() {
         if let By::SameAs(with) = step.by {
             join(number, with);
         }
@@ -227,9 +290,32 @@ fn bind(
 }
 
 impl Plan {
+    /// Creates the plan of compensations, whose skills were chosen with their steps.
+    pub(crate) fn of<'a>(chosen: impl Iterator<Item = (&'a Step, &'a Offer)>) -> Self {
+        let why = "it was chosen with the step that it undoes";
+        let steps = chosen.map(|(step, offer)| PlannedStep {
+            step: step.name.clone(),
+            needs: step
+                .needs
+                .iter()
+                .map(|need| PlannedNeed::chosen(need, offer, why))
+                .collect(),
+        });
+        Self {
+            steps: steps.collect(),
+        }
+    }
+
     /// Returns whether a skill is chosen for each need.
     pub(crate) fn is_complete(&self) -> bool {
         self.needs().all(|(_, need)| need.chosen.is_some())
+    }
+
+    /// Returns whether a need has no skill because only the component of a completed step could do
+    /// it: no component that comes later can help.
+    pub(crate) fn is_hopeless(&self) -> bool {
+        self.needs()
+            .any(|(_, need)| need.chosen.is_none() && need.is_bound)
     }
 
     /// Returns the needs without a skill, as text for people.
@@ -267,6 +353,18 @@ impl Plan {
         self.needs()
             .find(|(_, need)| need.role_is == role)
             .and_then(|(_, need)| need.chosen.as_deref())
+    }
+
+    /// Takes back the choice for a role.
+    fn refuse(&mut self, role: Role, why: &str) {
+        let needs = self.steps.iter_mut().flat_map(|step| &mut step.needs);
+        for need in needs.filter(|need| need.role_is == role) {
+            need.chosen = None;
+            for candidate in need.candidates.iter_mut().filter(|known| known.chosen) {
+                candidate.chosen = false;
+                why.clone_into(&mut candidate.why);
+            }
+        }
     }
 
     fn needs(&self) -> impl Iterator<Item = (&str, &PlannedNeed)> {
@@ -337,235 +435,6 @@ impl<'a> Team<'a> {
     }
 }
 
-#[derive(Debug, Clone, PartialEq, Eq)]
-enum NotFit {
-    Unrelated,
-    Because(String),
-}
-
-/// The judgement of offers for a process.
-struct Judging<'a> {
-    process: &'a Process,
-    fallen: &'a [Fallen],
-    check: &'a Check<'a>,
-    /// The tools that have to fill roles, with the steps that attach them.
-    tools: BTreeMap<Role, Option<Attached>>,
-}
-
-/// A tool by its IRI, and the name of the step that attaches it.
-type Attached = (String, String);
-
-impl Judging<'_> {
-    /// Returns the step of a sequence that has a role.
-    fn step(&self, role: Role) -> Option<&Step> {
-        match role {
-            Role::Alone(number) => self.process.steps.get(number),
-            Role::Ptp | Role::Linear | Role::Grasp | Role::Release => None,
-        }
-    }
-
-    /// Returns the tools that have to fill roles: a tool that a step attaches does all later steps
-    /// that it can do, until another tool is attached.
-    fn attached_tools(&self, offers: &[Offer]) -> BTreeMap<Role, Option<Attached>> {
-        let mut tools = BTreeMap::new();
-        if self.process.work != Job::Sequence {
-            return tools;
-        }
-        let mut attached: Option<Attached> = None;
-        for (number, step) in self.process.steps.iter().enumerate() {
-            let role = Role::Alone(number);
-            let fits = |offer: &&Offer| {
-                step.needs
-                    .iter()
-                    .all(|need| self.judge(need, offer).is_ok())
-            };
-            let is_tool = |of: &str| {
-                let of = TypeName::own(of).to_string();
-                let named = step
-                    .needs
-                    .iter()
-                    .filter_map(|need| need.skill_type.as_ref());
-                named.into_iter().any(|named| named.to_string() == of)
-                    || offers
-                        .iter()
-                        .filter(fits)
-                        .any(|offer| offer.types.contains(&of))
-            };
-            if is_tool("AttachToolSkillType") || is_tool("ChangeToolSkillType") {
-                let named = step.parameters.iter().find(|given| given.name == TOOL);
-                attached = named
-                    .and_then(|given| given.value.as_str())
-                    .map(|tool| (tool.to_owned(), step.name.clone()));
-                continue;
-            }
-            let can = |tool: &str| {
-                let mut fitting = offers.iter().filter(fits);
-                fitting.any(|offer| offer.component == tool)
-            };
-            let is_bound = match (&attached, step.by) {
-                (_, By::AttachedTool) => true,
-                (Some((tool, _)), By::Any) => can(tool),
-                (None, By::Any) | (_, By::SameAs(_)) => false,
-            };
-            if is_bound {
-                tools.insert(role, attached.clone());
-            }
-        }
-        tools
-    }
-
-    fn planned(&self, need: &Need, offers: &[Offer], team: Option<&Team<'_>>) -> PlannedNeed {
-        let chosen = team.and_then(|team| team.chosen.get(&need.role)).copied();
-        let mut candidates = Vec::new();
-        for offer in offers {
-            let judged = self.judge(need, offer);
-            // Skills with neither the capability nor the type are not listed as candidates.
-            if judged == Err(NotFit::Unrelated) {
-                continue;
-            }
-            let is_chosen = chosen.is_some_and(|chosen| chosen.skill == offer.skill);
-            let why = match judged {
-                Ok(fit) if is_chosen => fit,
-                Ok(_) => self.why_not(need, offer, chosen, team),
-                Err(NotFit::Unrelated) => String::new(),
-                Err(NotFit::Because(why)) => why,
-            };
-            candidates.push(Candidate {
-                skill: offer.skill.clone(),
-                name: offer.name.clone(),
-                component: offer.component.clone(),
-                component_name: offer.component_name.clone(),
-                chosen: is_chosen,
-                why,
-            });
-        }
-        candidates.sort_by(|one, other| {
-            (Reverse(one.chosen), &one.skill).cmp(&(Reverse(other.chosen), &other.skill))
-        });
-        PlannedNeed {
-            role: need.role.name(),
-            capability: need.capability.clone(),
-            skill_type: need.skill_type.as_ref().map(ToString::to_string),
-            chosen: chosen.map(|offer| offer.skill.clone()),
-            candidates,
-            role_is: need.role,
-        }
-    }
-
-    /// Returns the reason why an offer fits a need, or why it does not.
-    fn judge(&self, need: &Need, offer: &Offer) -> Result<String, NotFit> {
-        let has_capability = need
-            .capability
-            .as_ref()
-            .is_none_or(|wanted| offer.closure.contains(wanted));
-        let has_type = need
-            .skill_type
-            .as_ref()
-            .is_none_or(|wanted| offer.types.contains(&wanted.to_string()));
-        let is_related = (need.capability.is_some() && has_capability)
-            || (need.skill_type.is_some() && has_type);
-        if !is_related {
-            return Err(NotFit::Unrelated);
-        }
-        let because = |why: String| Err(NotFit::Because(why));
-        if !offer.is_skill {
-            return because(
-                "it is a service in a manifest; `ua-component` with `device: {mtp: ..}` runs it as a skill"
-                    .to_owned(),
-            );
-        }
-        if let (false, Some(wanted)) = (has_capability, &need.capability) {
-            let has = if offer.capabilities.is_empty() {
-                "no capability".to_owned()
-            } else {
-                offer.capabilities.join(", ")
-            };
-            return because(format!(
-                "it realises {has}, and none of that is {wanted} or below it"
-            ));
-        }
-        if let (false, Some(wanted)) = (has_type, &need.skill_type) {
-            return because(format!("its type is not {wanted} or below it"));
-        }
-        let fell = self.fallen.iter().find(|fallen| {
-            fallen.component == offer.component
-                && fallen.since_ms == offer.since_ms
-                && fallen
-                    .skill
-                    .as_ref()
-                    .is_none_or(|skill| *skill == offer.skill)
-        });
-        if let Some(fallen) = fell {
-            return because(fallen.why.clone());
-        }
-        match self.tools.get(&need.role) {
-            Some(None) => return because("no step before it attaches a tool".to_owned()),
-            Some(Some((tool, step))) if *tool != offer.component => {
-                return because(format!(
-                    "it is not of the tool {tool}, which the step `{step}` attaches"
-                ));
-            }
-            Some(Some(_)) | None => {}
-        }
-        if let Some(step) = self.step(need.role) {
-            (self.check)(offer, step).map_err(NotFit::Because)?;
-        }
-        let capability = need.capability.as_ref().map(|wanted| {
-            if offer.capabilities.contains(wanted) {
-                format!("it realises {wanted}")
-            } else {
-                format!(
-                    "it realises {}, which is below {wanted}",
-                    offer.capabilities.join(", ")
-                )
-            }
-        });
-        let of_type = need
-            .skill_type
-            .as_ref()
-            .map(|wanted| format!("its type is {} or below it", wanted.name));
-        let reasons: Vec<String> = capability.into_iter().chain(of_type).collect();
-        Ok(reasons.join(", "))
-    }
-
-    /// Returns the reason why a fitting offer is not chosen.
-    fn why_not(
-        &self,
-        need: &Need,
-        offer: &Offer,
-        chosen: Option<&Offer>,
-        team: Option<&Team<'_>>,
-    ) -> String {
-        if let Some(lacking) = team.and_then(|team| team.lacks.get(offer.component.as_str())) {
-            let lacking: Vec<_> = lacking
-                .iter()
-                .map(|role| match self.step(*role) {
-                    Some(step) => format!("the step `{}`", step.name),
-                    None => role.name().to_owned(),
-                })
-                .collect();
-            return format!(
-                "it would fit, but its component has nothing for {}",
-                lacking.join(" and ")
-            );
-        }
-        let Some(chosen) = chosen else {
-            return "it would fit this step".to_owned();
-        };
-        let better = if is_exact(&[need], chosen) && !is_exact(&[need], offer) {
-            "is of just this capability"
-        } else if chosen.since_ms < offer.since_ms {
-            "has been there for longer"
-        } else {
-            "comes first by its name"
-        };
-        format!(
-            "it would fit, but {}.{} {better}",
-            chosen.component_name, chosen.name
-        )
-    }
-}
-
 /// Returns whether the offer realises exactly the needed capabilities, not only subclasses of them.
 fn is_exact(needs: &[&Need], offer: &Offer) -> bool {
     needs
@@ -579,8 +448,5 @@ const PAIRS: [(&str, &str); 2] = [
     ("GraspSkillType", "ReleaseSkillType"),
     ("AttachToolSkillType", "DetachToolSkillType"),
 ];
-/// The parameter that names a tool by its ApplicationUri.
-const TOOL: &str = "ToolAppUri";
-
 #[cfg(test)]
 mod tests;

@@ -37,6 +37,8 @@ pub(crate) struct Step {
     /// The parameters of its skill, in a sequence.
     pub(crate) parameters: Vec<Given>,
     pub(crate) by: By,
+    /// The step that undoes this one after a later step has failed, in a sequence.
+    pub(crate) compensation: Option<Box<Self>>,
 }
 
 /// A parameter as the process gives it.
@@ -46,6 +48,16 @@ pub(crate) struct Given {
     pub(crate) value: serde_json::Value,
     /// The unit of the value; that of the skill if missing.
     pub(crate) unit: Option<String>,
+    /// The result that is the value; `value` is null then.
+    pub(crate) result: Option<ResultOf>,
+}
+
+/// A result of an earlier step.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct ResultOf {
+    /// The number of the step, from 0.
+    pub(crate) step: usize,
+    pub(crate) name: String,
 }
 
 /// The component that has to do a step of a sequence.
@@ -135,6 +147,29 @@ pub(crate) enum Group {
 }
 
 impl Process {
+    /// Returns the steps, and then their compensations, with the numbers of their roles.
+    pub(crate) fn numbered(&self) -> impl Iterator<Item = (usize, &Step)> {
+        let steps = self.steps.iter().enumerate();
+        let compensations = steps.filter_map(|(number, step)| {
+            let compensation = step.compensation.as_deref()?;
+            Some((self.compensation_of(number), compensation))
+        });
+        self.steps.iter().enumerate().chain(compensations)
+    }
+
+    /// Returns the number of the role of the compensation of a step.
+    pub(crate) fn compensation_of(&self, number: usize) -> usize {
+        self.steps.len().saturating_add(number)
+    }
+
+    /// Returns the step or the compensation with the number of its role.
+    pub(crate) fn step(&self, number: usize) -> Option<&Step> {
+        match number.checked_sub(self.steps.len()) {
+            None => self.steps.get(number),
+            Some(of) => self.steps.get(of)?.compensation.as_deref(),
+        }
+    }
+
     /// Returns the triples of the process. `type_iri` returns the IRI of a type, if it is known.
     pub(crate) fn triples(&self, type_iri: &dyn Fn(&TypeName) -> Option<String>) -> Vec<Triple> {
         let mut all = Vec::new();
@@ -163,56 +198,14 @@ impl Process {
         }
         let iris = self.step_iris();
         for ((step, position), step_iri) in self.steps.iter().zip(1_i64..).zip(&iris) {
-            for (given, number) in step.parameters.iter().zip(1..) {
-                let parameter = format!("{step_iri}/parameter/{number}");
-                say(step_iri, v::HAS_PARAMETER, iri(&parameter));
-                let name = Object::Text(given.name.clone());
-                say(&parameter, v::HAS_VARIABLE_NAME, name);
-                let (predicate, value) = literal(&given.value);
-                say(&parameter, predicate, value);
-                if let Some(unit) = &given.unit {
-                    say(&parameter, v::UNIT, Object::Text(unit.clone()));
-                }
-            }
-            match step.by {
-                By::Any => {}
-                By::SameAs(number) => {
-                    if let Some(other) = iris.get(number) {
-                        say(step_iri, v::BY_COMPONENT_OF, iri(other));
-                    }
-                }
-                By::AttachedTool => say(step_iri, v::BY_ATTACHED_TOOL, Object::Boolean(true)),
-            }
             say(&self.iri, v::HAS_STEP, iri(step_iri));
-            say(step_iri, v::RDF_TYPE, iri(v::STEP));
-            say(step_iri, v::RDFS_LABEL, Object::Text(step.name.clone()));
             say(step_iri, v::POSITION, Object::Integer(position));
-            for need in &step.needs {
-                let need_iri = format!("{step_iri}/{}", need.role.name());
-                say(step_iri, v::REQUIRES_CAPABILITY, iri(&need_iri));
-                say(&need_iri, v::RDF_TYPE, iri(v::REQUIRED_CAPABILITY));
-                say(
-                    &need_iri,
-                    v::ROLE,
-                    Object::Text(need.role.name().to_owned()),
-                );
-                if let Some(class) = need.capability.as_ref().filter(|class| is_iri(class)) {
-                    say(&need_iri, v::RDF_TYPE, iri(class));
-                    say(class, v::RDFS_SUB_CLASS_OF, iri(v::CAPABILITY));
-                }
-                if let Some(of) = &need.skill_type {
-                    let known = type_iri(of);
-                    // A type that no source describes stays a requirement.
-                    let unknown = || format!("urn:ua-bridge:type:{}", escaped(&of.to_string()));
-                    let type_iri = known.clone().unwrap_or_else(unknown);
-                    say(&need_iri, v::REQUIRES_TYPE, iri(&type_iri));
-                    if known.is_none() {
-                        say(&type_iri, v::BROWSE_NAME, Object::Text(of.name.clone()));
-                        let namespace = Object::Text(of.namespace.clone());
-                        say(&type_iri, v::NODE_NAMESPACE, namespace);
-                    }
-                }
+            if let Some(compensation) = &step.compensation {
+                let undo = format!("{step_iri}/compensation");
+                say(step_iri, v::COMPENSATED_BY, iri(&undo));
+                of_step(compensation, &undo, &iris, &mut say, type_iri);
             }
+            of_step(step, step_iri, &iris, &mut say, type_iri);
         }
         all
     }
@@ -230,6 +223,75 @@ impl Process {
             });
         }
         iris
+    }
+}
+
+/// States a step, or the compensation of a step.
+fn of_step(
+    step: &Step,
+    step_iri: &str,
+    iris: &[String],
+    say: &mut dyn FnMut(&str, &str, Object),
+    type_iri: &dyn Fn(&TypeName) -> Option<String>,
+) {
+    let iri = |iri: &str| Object::Iri(iri.to_owned());
+    for (given, number) in step.parameters.iter().zip(1..) {
+        let parameter = format!("{step_iri}/parameter/{number}");
+        say(step_iri, v::HAS_PARAMETER, iri(&parameter));
+        let name = Object::Text(given.name.clone());
+        say(&parameter, v::HAS_VARIABLE_NAME, name);
+        match &given.result {
+            Some(of) => {
+                if let Some(other) = iris.get(of.step) {
+                    say(&parameter, v::RESULT_OF, iri(other));
+                }
+                say(&parameter, v::RESULT, Object::Text(of.name.clone()));
+            }
+            None => {
+                let (predicate, value) = literal(&given.value);
+                say(&parameter, predicate, value);
+            }
+        }
+        if let Some(unit) = &given.unit {
+            say(&parameter, v::UNIT, Object::Text(unit.clone()));
+        }
+    }
+    match step.by {
+        By::Any => {}
+        By::SameAs(number) => {
+            if let Some(other) = iris.get(number) {
+                say(step_iri, v::BY_COMPONENT_OF, iri(other));
+            }
+        }
+        By::AttachedTool => say(step_iri, v::BY_ATTACHED_TOOL, Object::Boolean(true)),
+    }
+    say(step_iri, v::RDF_TYPE, iri(v::STEP));
+    say(step_iri, v::RDFS_LABEL, Object::Text(step.name.clone()));
+    for need in &step.needs {
+        let need_iri = format!("{step_iri}/{}", need.role.name());
+        say(step_iri, v::REQUIRES_CAPABILITY, iri(&need_iri));
+        say(&need_iri, v::RDF_TYPE, iri(v::REQUIRED_CAPABILITY));
+        say(
+            &need_iri,
+            v::ROLE,
+            Object::Text(need.role.name().to_owned()),
+        );
+        if let Some(class) = need.capability.as_ref().filter(|class| is_iri(class)) {
+            say(&need_iri, v::RDF_TYPE, iri(class));
+            say(class, v::RDFS_SUB_CLASS_OF, iri(v::CAPABILITY));
+        }
+        if let Some(of) = &need.skill_type {
+            let known = type_iri(of);
+            // A type that no source describes stays a requirement.
+            let unknown = || format!("urn:ua-bridge:type:{}", escaped(&of.to_string()));
+            let type_iri = known.clone().unwrap_or_else(unknown);
+            say(&need_iri, v::REQUIRES_TYPE, iri(&type_iri));
+            if known.is_none() {
+                say(&type_iri, v::BROWSE_NAME, Object::Text(of.name.clone()));
+                let namespace = Object::Text(of.namespace.clone());
+                say(&type_iri, v::NODE_NAMESPACE, namespace);
+            }
+        }
     }
 }
 

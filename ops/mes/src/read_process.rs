@@ -8,7 +8,7 @@ use serde_json::Value;
 use skills::TypeName;
 
 use crate::locate_skill::numbers_of;
-use crate::process::{By, Given, Job, Need, Process, Role, Step};
+use crate::process::{By, Given, Job, Need, Process, ResultOf, Role, Step};
 
 /// The processes of the graph: each can run, or has a reason why it cannot.
 #[derive(Debug, Default)]
@@ -49,12 +49,16 @@ fn process(iri: &str, rows: &[&Row], parameters: &[Row]) -> Result<Process, Stri
     let wait = seconds(one(rows, "wait")?, "ua:wait")?.unwrap_or(USUALLY_WAIT);
     let name = one(rows, "name")?.and_then(Value::as_str);
     let mut by_part: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
+    let mut undone: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
     for row in rows
         .iter()
         .filter(|row| !Answer::text(row, "part").is_empty())
     {
         let part = Answer::text(row, "part");
-        by_part.entry(part).or_default().push(row);
+        match Answer::text(row, "compensates") {
+            "" => by_part.entry(part).or_default().push(row),
+            of => undone.entry(of).or_default().push(row),
+        }
     }
     if by_part.is_empty() {
         return Err("it has no ua:hasStep".to_owned());
@@ -83,8 +87,20 @@ fn process(iri: &str, rows: &[&Row], parameters: &[Row]) -> Result<Process, Stri
     let mut steps = Vec::new();
     for (number, (_, part, rows)) in ordered.iter().enumerate() {
         let role = job.is_none().then_some(Role::Alone(number));
-        let step = step(part, rows, role, (&order, number), parameters);
-        steps.push(step.map_err(|why| format!("the step {part} {why}"))?);
+        let read = step(part, rows, role, (&order, number), parameters);
+        let mut read = read.map_err(|why| format!("the step {part} {why}"))?;
+        if let Some(rows) = undone.get(part) {
+            let role = Role::Alone(order.len().saturating_add(number));
+            let undone = compensation(&read.name, rows, role, (&order, number), parameters);
+            let undone = undone.map_err(|why| format!("the compensation of {part} {why}"))?;
+            if job.is_some() {
+                return Err(format!(
+                    "the step {part} has a ua:compensatedBy, and a pick-and-place process retreats by itself"
+                ));
+            }
+            read.compensation = Some(Box::new(undone));
+        }
+        steps.push(read);
     }
     if job.is_some() {
         let has = |role: &Role| {
@@ -187,23 +203,43 @@ fn step(
     }
     let needs = by_need.values().map(|rows| need(rows, role));
     let needs = needs.collect::<Result<_, _>>()?;
-    let mut given: Vec<Given> = Vec::new();
-    for row in parameters
-        .iter()
-        .filter(|row| Answer::text(row, "part") == part)
-    {
-        let parameter = given_by(row)?;
-        if given.iter().any(|known| known.name == parameter.name) {
-            return Err(format!("gives the parameter {} twice", parameter.name));
-        }
-        given.push(parameter);
-    }
+    let given = parameters_of(part, (order, number), parameters)?;
     Ok(Step {
         name: name.to_owned(),
         needs,
         parameters: given,
         by,
+        compensation: None,
     })
+}
+
+/// Reads the compensation of the step with a number. The component of the step does it, unless it
+/// says otherwise.
+fn compensation(
+    of: &str,
+    rows: &[&Row],
+    role: Role,
+    (order, number): (&[&str], usize),
+    parameters: &[Row],
+) -> Result<Step, String> {
+    let mut parts = rows.iter().map(|row| Answer::text(row, "part"));
+    let part = parts.next().unwrap_or_default();
+    if parts.any(|other| other != part) {
+        return Err("is given twice".to_owned());
+    }
+    let next = number.saturating_add(1);
+    let mut read = step(part, rows, Some(role), (order, next), parameters)?;
+    match read.by {
+        By::Any => read.by = By::SameAs(number),
+        By::SameAs(_) => {}
+        By::AttachedTool => {
+            return Err("has ua:byAttachedTool; give ua:byComponentOf".to_owned());
+        }
+    }
+    if one(rows, "step")?.is_none() {
+        read.name = format!("compensation of {of}");
+    }
+    Ok(read)
 }
 
 fn need(rows: &[&Row], role: Option<Role>) -> Result<Need, String> {
@@ -247,24 +283,67 @@ fn need(rows: &[&Row], role: Option<Role>) -> Result<Need, String> {
     })
 }
 
-fn given_by(row: &Row) -> Result<Given, String> {
+/// Reads the parameters of a step, which has a number among the steps, or of an action.
+pub(crate) fn parameters_of(
+    part: &str,
+    (order, number): (&[&str], usize),
+    parameters: &[Row],
+) -> Result<Vec<Given>, String> {
+    let mut given: Vec<Given> = Vec::new();
+    for row in parameters
+        .iter()
+        .filter(|row| Answer::text(row, "part") == part)
+    {
+        let parameter = given_by(row, (order, number))?;
+        if given.iter().any(|known| known.name == parameter.name) {
+            return Err(format!("gives the parameter {} twice", parameter.name));
+        }
+        given.push(parameter);
+    }
+    Ok(given)
+}
+
+/// Reads a parameter of the step with a number.
+fn given_by(row: &Row, (order, number): (&[&str], usize)) -> Result<Given, String> {
     let name = Answer::text(row, "name");
     if name.is_empty() {
         return Err("has a parameter without cask:hasVariableName".to_owned());
     }
     let is_there = |column: &str| row.get(column).filter(|value| !value.is_null());
-    let value = match (is_there("value"), is_there("json")) {
-        (Some(value), None) => value.clone(),
-        (None, Some(json)) => serde_json::from_str(json.as_str().unwrap_or_default())
-            .map_err(|error| format!("has a ua:valueJson of {name} that is no JSON: {error}"))?,
-        _ => return Err(format!("has no value, or several, for {name}")),
-    };
-    let unit = is_there("unit").and_then(Value::as_str);
-    Ok(Given {
+    let unit = is_there("unit").and_then(Value::as_str).map(str::to_owned);
+    let mut given = Given {
         name: name.to_owned(),
-        value,
-        unit: unit.map(str::to_owned),
-    })
+        value: Value::Null,
+        unit,
+        result: None,
+    };
+    match (is_there("value"), is_there("json"), is_there("result_of")) {
+        (Some(value), None, None) => given.value = value.clone(),
+        (None, Some(json), None) => {
+            given.value =
+                serde_json::from_str(json.as_str().unwrap_or_default()).map_err(|error| {
+                    format!("has a ua:valueJson of {name} that is no JSON: {error}")
+                })?;
+        }
+        (None, None, Some(of)) => {
+            if given.unit.is_some() {
+                return Err(format!(
+                    "has a ua:unit for {name}; a result has the unit of its skill"
+                ));
+            }
+            let of = of.as_str().unwrap_or_default();
+            let step = order.iter().position(|known| *known == of);
+            let step = step.filter(|step| *step < number);
+            let result = is_there("result").and_then(Value::as_str).unwrap_or(name);
+            given.result = Some(ResultOf {
+                step: step
+                    .ok_or_else(|| format!("takes {name} from {of}, which is no earlier step"))?,
+                name: result.to_owned(),
+            });
+        }
+        _ => return Err(format!("has no value, or several, for {name}")),
+    }
+    Ok(given)
 }
 
 /// Returns the value of a column, which must be the same in all rows that have it.
@@ -280,7 +359,7 @@ fn one<'a>(rows: &[&'a Row], column: &str) -> Result<Option<&'a Value>, String> 
     }
 }
 
-fn seconds(value: Option<&Value>, name: &str) -> Result<Option<Duration>, String> {
+pub(crate) fn seconds(value: Option<&Value>, name: &str) -> Result<Option<Duration>, String> {
     let Some(value) = value else {
         return Ok(None);
     };
@@ -290,8 +369,8 @@ fn seconds(value: Option<&Value>, name: &str) -> Result<Option<Duration>, String
         .ok_or_else(|| format!("its {name} is not a number of seconds: {value}"))
 }
 
-const USUALLY_WITHIN: Duration = Duration::from_secs(30);
-const USUALLY_WAIT: Duration = Duration::from_secs(60);
+pub(crate) const USUALLY_WITHIN: Duration = Duration::from_secs(30);
+pub(crate) const USUALLY_WAIT: Duration = Duration::from_secs(60);
 const USUALLY_APPROACH: f64 = 0.05;
 const MOST_STEPS: usize = 100;
 /// Longest time of a process in seconds.
@@ -340,6 +419,7 @@ mod tests {
             name: "Force".into(),
             value: serde_json::json!(12.5),
             unit: Some("N".into()),
+            result: None,
         };
         assert_eq!(process.steps[0].parameters, [force]);
         assert_eq!(
@@ -365,6 +445,11 @@ mod tests {
                 "is not a number of seconds",
             ),
             (", <urn:c:release> ]", "]", "without a capability or type"),
+            (
+                "ua:value 12.5 ; ua:unit \"N\"",
+                "ua:resultOf <urn:p/2>",
+                "takes Force from urn:p/2, which is no earlier step",
+            ),
         ] {
             assert!(TURTLE.contains(from), "{from}");
             let processes = read(&TURTLE.replace(from, to));
@@ -377,7 +462,7 @@ mod tests {
     #[test]
     fn processes_of_the_yaml_come_back_from_the_graph_as_they_were() {
         let example = include_str!("../../../examples/plant/mes.yaml");
-        let own = "  - process: urn:p\n    wait: 4 s\n    steps:\n      - {step: grip, needs: {skill: urn:c:grasp}, parameters: {Force: {value: 12.5, unit: N}, Name: a, All: [1, true], Deep: -3}}\n      - {step: hold, needs: {skill: {type: GraspSkillType}}, by: attached-tool}\n      - {step: hold, needs: {skill: {type: 'nsu=urn:maker;HoldType', capability: urn:c:hold}}, by: {component_of: grip}}\n";
+        let own = "  - process: urn:p\n    wait: 4 s\n    steps:\n      - {step: grip, needs: {skill: urn:c:grasp}, parameters: {Force: {value: 12.5, unit: N}, Name: a, All: [1, true], Deep: -3}}\n      - {step: hold, needs: {skill: {type: GraspSkillType}}, by: attached-tool, parameters: {Width: {result: Width, of: grip}}, compensation: {needs: {skill: urn:c:release}, by: {component_of: grip}}}\n      - {step: hold, needs: {skill: {type: 'nsu=urn:maker;HoldType', capability: urn:c:hold}}, by: {component_of: grip}, compensation: {step: let go, needs: {skill: urn:c:release}, parameters: {Speed: 2}}}\n";
         let shaped = "approach: 0.05, shape: {box: [0.04, 0.06, 0.05]}";
         assert!(example.contains("approach: 0.05"), "{example}");
         let example = example.replacen("approach: 0.05", shaped, 1);

@@ -55,6 +55,8 @@ pub(crate) struct Planned {
     pub(crate) reason: Option<String>,
     /// After a fault, whether the robot has retreated.
     pub(crate) retreated: Option<bool>,
+    /// Whether its skills undo completed steps of the run.
+    pub(crate) compensates: bool,
 }
 
 /// A run of a skill.
@@ -139,6 +141,11 @@ impl Run {
         }
     }
 
+    /// Returns the number of the run.
+    pub(crate) fn number(&self) -> Option<u64> {
+        self.run.rsplit_once('-')?.1.parse().ok()
+    }
+
     /// Returns the triples of the run.
     pub(crate) fn triples(&self) -> Vec<Triple> {
         let mut graph = Graph(Vec::new());
@@ -164,6 +171,9 @@ impl Run {
                 v::NUMBER,
                 Object::Integer(i64::try_from(plan.number).unwrap_or(i64::MAX)),
             );
+            if plan.compensates {
+                graph.say(&plan_iri, v::COMPENSATES, Object::Boolean(true));
+            }
             graph.ends(
                 &plan_iri,
                 plan.at_ms,
@@ -172,10 +182,14 @@ impl Run {
             );
             for (ran, position) in plan.ran.iter().zip(1_i64..) {
                 let part = format!("{plan_iri}/{position}");
+                let step = match plan.compensates {
+                    true => format!("{}/compensation", step_iri(&self.process, &ran.of)),
+                    false => step_iri(&self.process, &ran.of),
+                };
                 graph.say(&plan_iri, v::HAS_STEP, iri(&part));
                 graph.say(&part, v::RDF_TYPE, iri(v::STEP_RUN));
                 graph.say(&part, v::RDFS_LABEL, Object::Text(ran.step.clone()));
-                graph.say(&part, v::OF_STEP, iri(&step_iri(&self.process, &ran.of)));
+                graph.say(&part, v::OF_STEP, iri(&step));
                 graph.say(&part, v::POSITION, Object::Integer(position));
                 graph.say(&part, v::USES_SKILL, iri(&ran.skill));
                 graph.say(&part, v::USES_COMPONENT, iri(&ran.component));
@@ -185,7 +199,7 @@ impl Run {
                     (ran.ended_ms, ran.outcome),
                     ran.reason.as_deref(),
                 );
-                graph.provenance(&part, ran, &step_iri(&self.process, &ran.of));
+                graph.provenance(&part, ran, &step);
                 if let Some(previous) = previous.replace(part.clone()) {
                     graph.say(&part, v::PROV_WAS_INFORMED_BY, iri(&previous));
                 }
@@ -212,6 +226,21 @@ impl Ran {
 }
 
 impl Planned {
+    /// Creates the record of a plan that begins.
+    pub(crate) fn begins(number: usize, at_ms: u64, plan: Plan) -> Self {
+        Self {
+            number,
+            at_ms,
+            ended_ms: None,
+            plan,
+            ran: Vec::new(),
+            outcome: How::Running,
+            reason: None,
+            retreated: None,
+            compensates: false,
+        }
+    }
+
     /// Ends the plan. The ends of skills that are still running are unknown. The outcome of a plan
     /// with such a skill is unknown, unless the plan is done.
     pub(crate) fn end(&mut self, at: u64, outcome: How, reason: Option<String>) {

@@ -11,7 +11,7 @@ use plant_opcua::client::ClientUser;
 use skills::yaml::{Code, Findings, Kind, Node, Reader, parse};
 use skills::{Lds, Security, TypeName};
 
-use crate::process::{By, Given, Job, Need, Process, Role, Step};
+use crate::process::{By, Given, Job, Need, Process, ResultOf, Role, Step};
 
 pub(crate) use files::{Connect, Manifest, RmlSource, Source};
 
@@ -236,8 +236,9 @@ impl Reading<'_> {
         }
         let is_composite = composite.is_some();
         let mut steps: Vec<Step> = Vec::new();
+        let count = nodes.len().min(MOST_STEPS);
         for (number, node) in nodes.iter().take(MOST_STEPS).enumerate() {
-            let kind = is_composite.then_some(()).ok_or(number);
+            let kind = is_composite.then_some(()).ok_or((number, count));
             let step = self.step(node, kind, &steps);
             steps.extend(step);
         }
@@ -311,10 +312,16 @@ impl Reading<'_> {
         })
     }
 
-    /// Reads a step of a composite, or the step with a number that a single skill does.
-    fn step(&mut self, node: &Node, kind: Result<(), usize>, earlier: &[Step]) -> Option<Step> {
-        let keys = ["step", "needs", "parameters", "by"];
-        let [name, needs, parameters, by] = self.reader.map(node, keys)?;
+    /// Reads a step of a composite, or the step with a number that a single skill does; the second
+    /// number is that of all steps.
+    fn step(
+        &mut self,
+        node: &Node,
+        kind: Result<(), (usize, usize)>,
+        earlier: &[Step],
+    ) -> Option<Step> {
+        let keys = ["step", "needs", "parameters", "by", "compensation"];
+        let [name, needs, parameters, by, compensation] = self.reader.map(node, keys)?;
         let name = self
             .reader
             .needed(name, "step", node.place)
@@ -322,8 +329,102 @@ impl Reading<'_> {
         let needs = self.reader.needed(needs, "needs", node.place)?;
         let roles: Vec<Role> = match kind {
             Ok(()) => Role::OF_COMPOSITE.to_vec(),
-            Err(number) => vec![Role::Alone(number)],
+            Err((number, _)) => vec![Role::Alone(number)],
         };
+        let read = self.needs(needs, &roles)?;
+        let given = match parameters {
+            Some(parameters) => {
+                self.only_alone(
+                    parameters,
+                    kind.is_err(),
+                    "gives its skills their parameters",
+                )?;
+                self.parameters(parameters, earlier)?
+            }
+            None => Vec::new(),
+        };
+        let by = match by {
+            Some(by) => {
+                self.only_alone(
+                    by,
+                    kind.is_err(),
+                    "chooses one component for the tool and one for the robot",
+                )?;
+                self.by(by, earlier)?
+            }
+            None => By::Any,
+        };
+        let mut step = Step {
+            name: name?.to_owned(),
+            needs: read,
+            parameters: given,
+            by,
+            compensation: None,
+        };
+        if let Some(node) = compensation {
+            self.only_alone(node, kind.is_err(), "retreats by itself")?;
+            if let Err((number, count)) = kind {
+                let mut known = earlier.to_vec();
+                known.push(step.clone());
+                let read = self.compensation(node, number, count, &known)?;
+                step.compensation = Some(Box::new(read));
+            }
+        }
+        Some(step)
+    }
+
+    /// Reads the compensation of the last of these steps.
+    fn compensation(
+        &mut self,
+        node: &Node,
+        number: usize,
+        count: usize,
+        known: &[Step],
+    ) -> Option<Step> {
+        let keys = ["step", "needs", "parameters", "by"];
+        let [name, needs, parameters, by] = self.reader.map(node, keys)?;
+        let of = known.last().map_or("", |step| step.name.as_str());
+        let name = match name {
+            Some(name) => self.reader.text(name, "a name")?.to_owned(),
+            None => format!("compensation of {of}"),
+        };
+        let needs = self.reader.needed(needs, "needs", node.place)?;
+        let role = Role::Alone(count.saturating_add(number));
+        let needs = self.needs(needs, &[role])?;
+        let parameters = match parameters {
+            Some(parameters) => self.parameters(parameters, known)?,
+            None => Vec::new(),
+        };
+        let by = match by {
+            Some(by) => match self.by(by, known)? {
+                By::AttachedTool => {
+                    let why = "a compensation is done by the component of a step, as {component_of: STEP}";
+                    return self.reader.refuse(by, Code::WrongValue, why.to_owned());
+                }
+                by @ (By::Any | By::SameAs(_)) => by,
+            },
+            None => By::SameAs(number),
+        };
+        Some(Step {
+            name,
+            needs,
+            parameters,
+            by,
+            compensation: None,
+        })
+    }
+
+    /// Refuses a key of a step that only steps of a sequence have.
+    fn only_alone(&mut self, node: &Node, is_alone: bool, why: &str) -> Option<()> {
+        match is_alone {
+            true => Some(()),
+            false => self
+                .reader
+                .refuse(node, Code::UnknownKey, format!("`pick_and_place` {why}")),
+        }
+    }
+
+    fn needs(&mut self, needs: &Node, roles: &[Role]) -> Option<Vec<Need>> {
         let Kind::Map(pairs) = &needs.kind else {
             self.reader.wrong(needs, "a map from what a skill is for to the capability it needs, as `grasp: urn:example:capability:grasp`");
             return None;
@@ -348,61 +449,74 @@ impl Reading<'_> {
             self.reader
                 .refuse::<()>(needs, Code::MissingKey, "a step needs a skill".to_owned());
         }
-        let mut given = Vec::new();
-        if let Some(parameters) = parameters {
-            if kind.is_ok() {
-                self.reader.refuse::<()>(
-                    parameters,
-                    Code::UnknownKey,
-                    "`pick_and_place` gives its skills their parameters".to_owned(),
-                );
-            }
-            let Kind::Map(pairs) = &parameters.kind else {
-                self.reader
-                    .wrong(parameters, "a map from names of parameters to values");
-                return None;
-            };
-            for (key, value) in pairs {
-                if let Some(name) = self.reader.text(key, "the name of a parameter") {
-                    given.extend(self.given(name, value));
-                }
-            }
-        }
-        let by = match by {
-            Some(by) if kind.is_ok() => {
-                let why =
-                    "`pick_and_place` chooses one component for the tool and one for the robot";
-                return self.reader.refuse(by, Code::UnknownKey, why.to_owned());
-            }
-            Some(by) => self.by(by, earlier)?,
-            None => By::Any,
-        };
-        Some(Step {
-            name: name?.to_owned(),
-            needs: read,
-            parameters: given,
-            by,
-        })
+        Some(read)
     }
 
-    /// Reads a parameter: its value, or a map of `value` and `unit`.
-    fn given(&mut self, name: &str, node: &Node) -> Option<Given> {
-        let (value, unit) = match &node.kind {
-            Kind::Map(_) => {
-                let [value, unit] = self.reader.map(node, ["value", "unit"])?;
-                let value = self.reader.needed(value, "value", node.place)?;
-                let unit = match unit {
-                    Some(unit) => Some(self.reader.text(unit, "a unit")?.to_owned()),
-                    None => None,
-                };
-                (value, unit)
-            }
-            Kind::Scalar(_) | Kind::List(_) | Kind::Null => (node, None),
+    /// Reads the parameters of a step, which follows these steps.
+    fn parameters(&mut self, node: &Node, earlier: &[Step]) -> Option<Vec<Given>> {
+        let Kind::Map(pairs) = &node.kind else {
+            self.reader
+                .wrong(node, "a map from names of parameters to values");
+            return None;
         };
-        Some(Given {
+        let mut given = Vec::new();
+        for (key, value) in pairs {
+            if let Some(name) = self.reader.text(key, "the name of a parameter") {
+                given.extend(self.given(name, value, earlier));
+            }
+        }
+        Some(given)
+    }
+
+    /// Reads a parameter: its value, a map of `value` and `unit`, or the result of a step.
+    fn given(&mut self, name: &str, node: &Node, earlier: &[Step]) -> Option<Given> {
+        let mut given = Given {
             name: name.to_owned(),
-            value: json(value),
-            unit,
+            value: serde_json::Value::Null,
+            unit: None,
+            result: None,
+        };
+        if !matches!(&node.kind, Kind::Map(_)) {
+            given.value = json(node);
+            return Some(given);
+        }
+        let [value, unit, result, of] = self.reader.map(node, ["value", "unit", "result", "of"])?;
+        if let Some(unit) = unit {
+            given.unit = Some(self.reader.text(unit, "a unit")?.to_owned());
+        }
+        if result.is_none() && of.is_none() {
+            given.value = json(self.reader.needed(value, "value", node.place)?);
+            return Some(given);
+        }
+        if let Some(other) = value.or(unit) {
+            let why = "a result has the value and the unit of its skill";
+            return self.reader.refuse(other, Code::WrongValue, why.to_owned());
+        }
+        let of = self.reader.needed(of, "of", node.place)?;
+        let step = self.earlier(of, earlier)?;
+        let result = match result {
+            Some(result) => self.reader.text(result, "the name of a result")?,
+            None => name,
+        };
+        given.result = Some(ResultOf {
+            step,
+            name: result.to_owned(),
+        });
+        Some(given)
+    }
+
+    /// Reads the name of an earlier step. Returns its number.
+    fn earlier(&mut self, node: &Node, earlier: &[Step]) -> Option<usize> {
+        let name = self.reader.text(node, "the name of a step")?;
+        let number = earlier.iter().position(|step| step.name == name);
+        number.or_else(|| {
+            let known: Vec<_> = earlier.iter().map(|step| step.name.as_str()).collect();
+            let why = format!(
+                "no earlier step is called `{}`; there are {}",
+                shortened(name),
+                known.join(", ")
+            );
+            self.reader.refuse(node, Code::WrongValue, why)
         })
     }
 
@@ -419,17 +533,7 @@ impl Reading<'_> {
         }
         let [of] = self.reader.map(node, ["component_of"])?;
         let of = self.reader.needed(of, "component_of", node.place)?;
-        let name = self.reader.text(of, "the name of a step")?;
-        let number = earlier.iter().position(|step| step.name == name);
-        number.map(By::SameAs).or_else(|| {
-            let known: Vec<_> = earlier.iter().map(|step| step.name.as_str()).collect();
-            let why = format!(
-                "no earlier step is called `{}`; there are {}",
-                shortened(name),
-                known.join(", ")
-            );
-            self.reader.refuse(of, Code::WrongValue, why)
-        })
+        self.earlier(of, earlier).map(By::SameAs)
     }
 
     fn need(&mut self, node: &Node, role: Role) -> Option<Need> {

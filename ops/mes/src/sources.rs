@@ -60,6 +60,11 @@ impl Sources {
             let all = node_set(&ours)?;
             self.put(source, &all.triples, Lasting::No)
         });
+        let units = Source::new(SourceKind::File, "units of measurement");
+        named.insert(units.clone());
+        self.try_one(units, |source| {
+            self.put(source, &knowledge::units::triples(), Lasting::No)
+        });
         for file in &settings.nodesets {
             // The graph of a NodeSet is named by its namespace, which only the file has.
             let read = bytes(file).and_then(|bytes| node_set(&decoded(&bytes)?));

@@ -2,6 +2,7 @@
 
 mod cell;
 mod discover;
+mod job;
 mod live;
 mod module;
 mod recording;
@@ -18,6 +19,7 @@ pub(crate) use recording::{Record, Replay, Viewers};
 pub(crate) use tap::Tap;
 pub(crate) use write::Write;
 
+pub(crate) use job::{GoalArguments, JobArguments, JobVerb};
 pub(crate) use module::{MtpArguments, MtpRdf, MtpSkills, MtpVerb, PeaArguments};
 
 use std::path::PathBuf;
@@ -289,6 +291,20 @@ pub(crate) enum Verb {
     /// time, or the user may not change sources, 74 a file cannot be read or the output cannot be
     /// written.
     Source(Source),
+    /// Start, list and stop jobs: runs of the processes that ua-mes knows
+    ///
+    /// Exit codes: 0 done, 1 the job failed (with --wait), 64 usage, or an unknown process or job,
+    /// 69 no answer in time, the outcome of the job is unknown, or the user may not run jobs, 74 the
+    /// output cannot be written.
+    Job(JobArguments),
+    /// Show the sequence of actions that reaches a goal, with the proof of each step
+    ///
+    /// Actions are capabilities with facts that hold before and after them. Those with a skill in
+    /// the plant are used. `ua-space job start GOAL` runs the sequence.
+    ///
+    /// Exit codes: 0 done, 1 the goal cannot be reached, 64 usage, or an unknown goal, 69 no answer
+    /// in time, 74 the output cannot be written.
+    Goal(GoalArguments),
     /// Run an RML mapping of XML files and print RDF
     ///
     /// The mapping is Turtle in the vocabulary of R2RML and RML (semweb.mmlab.be/ns/rml#) or in

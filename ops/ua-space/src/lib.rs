@@ -16,11 +16,13 @@ mod environment;
 mod exit;
 mod explain;
 mod fault;
+mod goal;
 mod hex;
 mod http;
 mod init;
 mod input;
 mod interrupt;
+mod job;
 mod json_file;
 mod keys;
 mod layout;
@@ -107,6 +109,8 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Ask(arguments) => ask::ask(arguments),
         Verb::Plan(arguments) => plan::plan(arguments),
         Verb::Source(arguments) => source::source(arguments),
+        Verb::Goal(arguments) => goal::goal(arguments),
+        Verb::Job(arguments) => job::job(arguments),
         Verb::Rml(arguments) => rml::rml(arguments),
         Verb::Owl(arguments) => owl::owl(arguments),
         Verb::Mtp(arguments) => mtp_files::mtp(arguments),

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use crate::arguments::{Source, SourceAt, SourceVerb};
 use crate::ask::refusal;
 use crate::exit::Failure;
-use crate::http::{Change, Server, encoded};
+use crate::http::{Answer, Change, Server, encoded};
 use crate::input::read;
 use crate::live::{Table, harmless, is_coloured};
 use crate::report::say;
@@ -40,7 +40,11 @@ pub(crate) fn source(arguments: &Source) -> Result<(), Failure> {
             };
             let path = format!("/sources/{}/{}", encoded(&kind), encoded(&name));
             let done = change("PUT", &path, ("application/octet-stream", contents), at)?;
-            let verb = if done == CREATED { "added" } else { "replaced" };
+            let verb = if done.status == CREATED {
+                "added"
+            } else {
+                "replaced"
+            };
             say(&format!("{kind} {name}: {verb}"))
         }
         SourceVerb::Remove { kind, name, at } => {
@@ -207,13 +211,13 @@ fn told(conforms: bool) -> Result<(), Failure> {
     }
 }
 
-/// Sends a change. Returns the status.
-fn change(
+/// Sends a change. Returns the response, which is no refusal.
+pub(crate) fn change(
     method: &'static str,
     path: &str,
     (content_type, body): (&'static str, Vec<u8>),
     at: &SourceAt,
-) -> Result<u16, Failure> {
+) -> Result<Answer, Failure> {
     let server = Server::parse(&at.url)?;
     let user = match (&at.user, &at.password) {
         (Some(user), Some(password)) => Some((user.clone(), password.clone())),
@@ -232,7 +236,7 @@ fn change(
     look(async {
         let answer = server.change(path, change).await?;
         match answer.status {
-            200..=299 => Ok(answer.status),
+            200..=299 => Ok(answer),
             _ => Err(refusal(&answer)),
         }
     })

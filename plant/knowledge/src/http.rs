@@ -169,6 +169,9 @@ impl Site {
             path if path == "/sources" || path.starts_with("/sources/") => {
                 return self.sources(request).await;
             }
+            path if path == "/jobs" || path.starts_with("/jobs/") => {
+                return self.jobs(request).await;
+            }
             _ => {}
         }
         if request.method() != Method::GET {
@@ -191,7 +194,7 @@ impl Site {
                 None => match (self.page)(path) {
                     Some(page) => Ok(content(JSON, page.into_bytes())),
                     None => Err(Refusal::unknown(
-                        "there are /sparql, /update, /store, /sources, /ask, /ask/NAME, /graphs, /data, /report and /status here"
+                        "there are /sparql, /update, /store, /sources, /jobs, /ask, /ask/NAME, /graphs, /data, /report and /status here"
                             .to_owned(),
                     )),
                 },

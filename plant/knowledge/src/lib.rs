@@ -16,7 +16,7 @@
 //! `journal` (lasting sources), `component` and `nodeset` (facts to statements), `question` (named
 //! queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the queries that run at a
 //! time), `http`, `update` and `writes` (changes by users), `shapes` and `checking` (the SHACL
-//! report).
+//! report), `units` (conversion of numbers).
 
 mod bounds;
 mod checking;
@@ -31,6 +31,7 @@ mod question;
 mod shapes;
 mod source;
 mod store;
+pub mod units;
 mod update;
 mod writes;
 mod writing;
@@ -44,7 +45,7 @@ pub use query::Limits;
 pub use question::{Answer, QUESTIONS, Question, QuestionFault};
 pub use source::{Source, SourceKind};
 pub use store::{Knowledge, KnowledgeFault, Lasting, SourceStatus};
-pub use writes::{May, SourceFiles, Writes};
+pub use writes::{Jobs, May, SourceFiles, Writes};
 
 /// Returns an empty folder for a test.
 #[cfg(test)]

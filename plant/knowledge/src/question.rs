@@ -80,6 +80,14 @@ pub const QUESTIONS: &[Question] = &[
         sparql: include_str!("../queries/access-of.rq"),
     },
     Question {
+        name: "action-parameters",
+        sparql: include_str!("../queries/action-parameters.rq"),
+    },
+    Question {
+        name: "actions",
+        sparql: include_str!("../queries/actions.rq"),
+    },
+    Question {
         name: "candidates",
         sparql: include_str!("../queries/candidates.rq"),
     },
@@ -94,6 +102,10 @@ pub const QUESTIONS: &[Question] = &[
     Question {
         name: "components-of",
         sparql: include_str!("../queries/components-of.rq"),
+    },
+    Question {
+        name: "goals",
+        sparql: include_str!("../queries/goals.rq"),
     },
     Question {
         name: "modules-with",
@@ -166,6 +178,10 @@ pub const QUESTIONS: &[Question] = &[
     Question {
         name: "types",
         sparql: include_str!("../queries/types.rq"),
+    },
+    Question {
+        name: "what-can-hold",
+        sparql: include_str!("../queries/what-can-hold.rq"),
     },
     Question {
         name: "what-can-run",

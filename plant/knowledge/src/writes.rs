@@ -31,8 +31,12 @@ pub struct Writes {
     pub now: fn() -> u64,
     /// Returns whether a user with a password, or a client without them, may write.
     pub may: May,
+    /// Returns whether a client may start and stop jobs.
+    pub may_run: May,
     /// The sources that are files of their own formats.
     pub files: Arc<dyn SourceFiles>,
+    /// The jobs: runs of processes.
+    pub jobs: Arc<dyn Jobs>,
 }
 
 /// Decides whether a client may write.
@@ -58,6 +62,22 @@ pub trait SourceFiles: Send + Sync {
     fn list(&self) -> serde_json::Value;
 }
 
+/// Runs of processes that clients start and stop.
+pub trait Jobs: Send + Sync {
+    /// Starts a process. Returns the number of the job; `None` if too many jobs are running.
+    ///
+    /// # Errors
+    /// The reason why the process cannot run.
+    fn start(&self, process: &str) -> Result<Option<u64>, String>;
+
+    /// Stops a running job, or gives back the components of a job with an unknown outcome. Returns
+    /// whether there is such a job.
+    fn stop(&self, number: u64) -> bool;
+
+    /// Returns all jobs as JSON.
+    fn list(&self) -> serde_json::Value;
+}
+
 impl fmt::Debug for Writes {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Writes").finish_non_exhaustive()
@@ -68,31 +88,57 @@ impl fmt::Debug for Writes {
 pub(crate) const UPDATE: &str = "application/sparql-update";
 
 impl Site {
-    /// Checks whether the client may write: updates are served, the request does not come from a
-    /// page of another site in a browser, and the user has the role.
+    /// Checks whether updates are served, and the client may write.
     async fn may_write(&self, request: &Request<Incoming>) -> Result<&Writes, Refusal> {
         let writes = self.writes.as_ref().ok_or(QueryFault::ReadOnly)?;
-        let origin = request.headers().get(ORIGIN);
-        let is_own = origin.is_none_or(|origin| {
-            let origin = origin.to_str().unwrap_or_default();
-            let host = origin.split_once("://").map_or("", |(_, host)| host);
-            is_loopback_host(host)
-        });
-        if !is_own {
-            let why = "pages of other sites cannot change what is known";
-            return Err(Refusal::new(StatusCode::FORBIDDEN, "origin", why));
+        let why = "a change needs the name and password of a user with the role engineer";
+        require(&writes.may, request, why).await?;
+        Ok(writes)
+    }
+
+    /// Lists, starts and stops jobs: `/jobs`, `/jobs/NUMBER`.
+    pub(crate) async fn jobs(
+        &self,
+        request: Request<Incoming>,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        let writes = self.writes.clone().ok_or(QueryFault::ReadOnly)?;
+        let path = request.uri().path().to_owned();
+        let number = path.strip_prefix("/jobs/").unwrap_or_default();
+        let method = request.method().clone();
+        if method == Method::GET && number.is_empty() {
+            return Ok(json_page(&writes.jobs.list()));
         }
-        let user = request.headers().get(AUTHORIZATION).and_then(|value| {
-            let encoded = value.to_str().ok()?.strip_prefix("Basic ")?;
-            let text = String::from_utf8(STANDARD.decode(encoded.trim()).ok()?).ok()?;
-            let (name, password) = text.split_once(':')?;
-            Some((name.to_owned(), password.to_owned()))
-        });
-        if (writes.may)(user).await {
-            Ok(writes)
-        } else {
-            let why = "a change needs the name and password of a user with the role engineer";
-            Err(Refusal::new(StatusCode::UNAUTHORIZED, "user", why))
+        let why = "a job needs the name and password of a user with the role operator";
+        match (method, number) {
+            (Method::POST, "") => {
+                require(&writes.may_run, &request, why).await?;
+                let body = self.upload(request, LARGEST_JOB).await?;
+                let asked: Option<serde_json::Value> = serde_json::from_slice(&body).ok();
+                let process = asked
+                    .as_ref()
+                    .and_then(|asked| asked.get("process")?.as_str());
+                let process = process.ok_or_else(|| {
+                    Refusal::malformed("a job is JSON: {\"process\": \"IRI of the process\"}")
+                })?;
+                let started = writes.jobs.start(process).map_err(Refusal::unknown)?;
+                let job = started.ok_or_else(|| {
+                    let why = "too many jobs are running; start it when one of them has ended";
+                    Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "busy", why)
+                })?;
+                let mut response = json_page(&json!({ "job": job }));
+                *response.status_mut() = StatusCode::CREATED;
+                Ok(response)
+            }
+            (Method::DELETE, number) => {
+                require(&writes.may_run, &request, why).await?;
+                match number.parse().is_ok_and(|number| writes.jobs.stop(number)) {
+                    true => Ok(status(StatusCode::NO_CONTENT)),
+                    false => Err(Refusal::unknown("there is no such job".to_owned())),
+                }
+            }
+            _ => Err(Refusal::method(
+                "GET, POST at /jobs, DELETE at /jobs/NUMBER",
+            )),
         }
     }
 
@@ -275,6 +321,31 @@ impl Site {
     }
 }
 
+/// Checks whether a client may do something: the request does not come from a page of another site
+/// in a browser, and the user has the role.
+async fn require(may: &May, request: &Request<Incoming>, why: &str) -> Result<(), Refusal> {
+    let origin = request.headers().get(ORIGIN);
+    let is_own = origin.is_none_or(|origin| {
+        let origin = origin.to_str().unwrap_or_default();
+        let host = origin.split_once("://").map_or("", |(_, host)| host);
+        is_loopback_host(host)
+    });
+    if !is_own {
+        let why = "pages of other sites cannot change what is known";
+        return Err(Refusal::new(StatusCode::FORBIDDEN, "origin", why));
+    }
+    let user = request.headers().get(AUTHORIZATION).and_then(|value| {
+        let encoded = value.to_str().ok()?.strip_prefix("Basic ")?;
+        let text = String::from_utf8(STANDARD.decode(encoded.trim()).ok()?).ok()?;
+        let (name, password) = text.split_once(':')?;
+        Some((name.to_owned(), password.to_owned()))
+    });
+    match may(user).await {
+        true => Ok(()),
+        false => Err(Refusal::new(StatusCode::UNAUTHORIZED, "user", why)),
+    }
+}
+
 impl From<KnowledgeFault> for Refusal {
     fn from(fault: KnowledgeFault) -> Self {
         let (status, code) = match &fault {
@@ -321,3 +392,4 @@ fn failed(error: &dyn fmt::Display) -> Refusal {
 static UPLOADS: Semaphore = Semaphore::const_new(2);
 const LARGEST_FILE: usize = 256 << 20;
 const LONGEST_NAME: usize = 256;
+const LARGEST_JOB: usize = 4096;

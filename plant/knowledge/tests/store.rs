@@ -139,6 +139,55 @@ fn a_component_is_found_by_what_it_can_do_until_it_is_gone() {
 }
 
 #[test]
+fn a_quantity_is_held_by_skills_whose_limits_contain_it_in_any_unit() {
+    let knowledge = Knowledge::new().unwrap();
+    let units = Source::new(SourceKind::File, "units");
+    knowledge
+        .replace(&units, &knowledge::units::triples(), 1)
+        .unwrap();
+    let facts = gripper(
+        "urn:example:gripper",
+        vec![grasp_type(), skill_type()],
+        GRASP,
+    );
+    put(&knowledge, &facts, 5);
+    let held = |quantity: &str, capability: &str| {
+        let parameters = match capability {
+            "" => vec![("quantity", quantity)],
+            _ => vec![("quantity", quantity), ("capability", capability)],
+        };
+        let found = ask(&knowledge, "what-can-hold", &parameters);
+        let limit = |row: &BTreeMap<String, serde_json::Value>| {
+            (Answer::text(row, "limit").to_owned(), row["value"].as_f64())
+        };
+        found.rows.iter().map(limit).collect::<Vec<_>>()
+    };
+    let force = ("Force".to_owned(), Some(50.0));
+    assert_eq!(held("0.05 kN", ""), [force.clone()]);
+    assert_eq!(held("50 N", GRASP), [force]);
+    for (quantity, capability) in [
+        ("86 N", ""),
+        ("3 kg", ""),
+        ("50", ""),
+        ("x N", ""),
+        ("50 N", "urn:fly"),
+    ] {
+        assert_eq!(held(quantity, capability), [], "{quantity}");
+    }
+    // The data sheet of the component as Turtle.
+    let sheet = Source::new(SourceKind::File, "sheet.ttl");
+    let turtle = r#"<urn:example:gripper> <urn:ua-bridge:plant#hasLimit> [
+        <http://www.w3id.org/hsu-aut/cask#hasVariableName> "Payload" ;
+        <urn:ua-bridge:plant#max> 5000 ; <urn:ua-bridge:plant#unit> "g" ] ."#;
+    knowledge.replace_turtle(&sheet, turtle, 1).unwrap();
+    assert_eq!(held("3 kg", GRASP), [("Payload".to_owned(), Some(3000.0))]);
+    assert_eq!(held("6 kg", GRASP), []);
+    let found = ask(&knowledge, "what-can-hold", &[("quantity", "3 kg")]);
+    assert_eq!(found.rows[0]["source"], sheet.graph());
+    assert_eq!(ask(&knowledge, "what-can-hold", &[]).rows.len(), 2);
+}
+
+#[test]
 fn every_question_parses_and_tells_its_parameters() {
     let knowledge = Knowledge::new().unwrap();
     for question in QUESTIONS {

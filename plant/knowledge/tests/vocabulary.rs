@@ -60,6 +60,10 @@ fn questions_ask_for_terms_of_the_table_only() {
             else {
                 continue;
             };
+            // The datatypes to which queries convert are no terms of the plant.
+            if prefix == "xsd" {
+                continue;
+            }
             let iri = format!("{base}{local}");
             assert!(known.contains(&*iri), "{}: {word}", question.name);
         }

@@ -4,7 +4,7 @@
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 
-use knowledge::{Endpoint, Knowledge, Limits, Source, SourceFiles, SourceKind, Writes};
+use knowledge::{Endpoint, Jobs, Knowledge, Limits, Source, SourceFiles, SourceKind, Writes};
 
 use crate::http::{Answered, send};
 
@@ -34,6 +34,32 @@ impl SourceFiles for Files {
     }
 }
 
+/// Keeps the processes of the jobs; a job is its position from 1.
+#[derive(Default)]
+struct Started(Mutex<Vec<String>>);
+
+impl Jobs for Started {
+    fn start(&self, process: &str) -> Result<Option<u64>, String> {
+        if process != "urn:p" {
+            return Err(format!("`{process}` is no process here"));
+        }
+        let mut all = self.0.lock().unwrap();
+        if all.len() == 2 {
+            return Ok(None);
+        }
+        all.push(process.to_owned());
+        Ok(u64::try_from(all.len()).ok())
+    }
+
+    fn stop(&self, number: u64) -> bool {
+        (1..=self.0.lock().unwrap().len()).any(|known| u64::try_from(known) == Ok(number))
+    }
+
+    fn list(&self) -> serde_json::Value {
+        serde_json::json!({ "jobs": *self.0.lock().unwrap() })
+    }
+}
+
 async fn site(may: bool) -> (Endpoint, Arc<Knowledge>) {
     let knowledge = Arc::new(Knowledge::new().unwrap());
     let turtle = "<urn:c:below> <http://www.w3.org/2000/01/rdf-schema#subClassOf> <urn:c:above> .";
@@ -45,7 +71,12 @@ async fn site(may: bool) -> (Endpoint, Arc<Knowledge>) {
             let is_anna = user == Some(("anna".to_owned(), "secret: 1".to_owned()));
             Box::pin(async move { may || is_anna })
         }),
+        may_run: Arc::new(move |user| {
+            let is_otto = user.is_some_and(|(name, _)| name == "otto");
+            Box::pin(async move { may || is_otto })
+        }),
         files: Arc::new(Files::default()),
+        jobs: Arc::new(Started::default()),
     };
     let endpoint = Endpoint::bind_with(
         "127.0.0.1:0".parse().unwrap(),
@@ -282,4 +313,49 @@ async fn only_users_with_the_role_write_and_no_page_of_another_site() {
     assert_eq!(*knowledge.changes().borrow(), before + 1);
     // Queries need no user.
     assert_eq!(rows(at, "SELECT ?s { ?s <urn:p> ?o }").await, ["urn:a"]);
+}
+
+#[tokio::test]
+async fn jobs_are_started_listed_and_stopped_by_operators() {
+    let (endpoint, _) = site(false).await;
+    let at = endpoint.address();
+    // otto:x
+    let otto = ("Authorization", "Basic b3R0bzp4");
+    let job = r#"{"process": "urn:p"}"#;
+    let refused = request(at, "POST /jobs", &[], job).await;
+    assert_eq!(refused.status, 401, "{}", refused.body);
+    let anna = ("Authorization", "Basic YW5uYTpzZWNyZXQ6IDE=");
+    assert_eq!(request(at, "POST /jobs", &[anna], job).await.status, 401);
+    let evil = ("Origin", "https://evil.example");
+    assert_eq!(
+        request(at, "POST /jobs", &[otto, evil], job).await.status,
+        403
+    );
+    let started = request(at, "POST /jobs", &[otto], job).await;
+    assert_eq!((started.status, started.body.trim()), (201, r#"{"job":1}"#));
+    let unknown = request(at, "POST /jobs", &[otto], r#"{"process": "urn:q"}"#).await;
+    assert_eq!(unknown.status, 404);
+    assert!(
+        unknown.body.contains("`urn:q` is no process here"),
+        "{}",
+        unknown.body
+    );
+    for body in ["", "urn:p", r#"{"process": 7}"#] {
+        assert_eq!(request(at, "POST /jobs", &[otto], body).await.status, 400);
+    }
+    let listed = request(at, "GET /jobs", &[], "").await;
+    assert_eq!(
+        (listed.status, listed.body.trim()),
+        (200, r#"{"jobs":["urn:p"]}"#)
+    );
+    assert_eq!(request(at, "DELETE /jobs/1", &[otto], "").await.status, 204);
+    for path in ["/jobs/2", "/jobs/x", "/jobs/", "/jobs"] {
+        let line = format!("DELETE {path}");
+        assert_eq!(request(at, &line, &[otto], "").await.status, 404, "{path}");
+    }
+    assert_eq!(request(at, "PUT /jobs/1", &[otto], "").await.status, 405);
+    assert_eq!(request(at, "POST /jobs", &[otto], job).await.status, 201);
+    let busy = request(at, "POST /jobs", &[otto], job).await;
+    assert_eq!(busy.status, 503, "{}", busy.body);
+    assert_eq!(request(at, "DELETE /jobs/1", &[], "").await.status, 401);
 }

@@ -1,10 +1,10 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use knowledge::{Knowledge, Source, SourceKind};
-use skills::TypeName;
+use skills::{Outcome, TypeName};
 
 use super::*;
-use crate::process::{Given, Need, Step};
+use crate::process::{By, Given, Need, ResultOf, Step};
 
 /// A plant for tests. Its skills do nothing and record their runs.
 struct Fakes {
@@ -23,6 +23,7 @@ struct Fakes {
     journal: Mutex<Vec<String>>,
     kept: Mutex<Vec<Run>>,
     clock: AtomicU64,
+    leases: Mutex<BTreeMap<String, String>>,
     /// Appears when a component is lost.
     spare: Mutex<Vec<Offer>>,
 }
@@ -67,11 +68,42 @@ impl Plant for Arc<Fakes> {
     fn values(&self, _skill: &str, given: &[Given]) -> Result<Vec<(String, Value)>, String> {
         given
             .iter()
+            .filter(|given| given.result.is_none())
             .map(|given| {
                 let number = given.value.as_f64().ok_or("no number")?;
                 Ok((given.name.clone(), Value::Double(number)))
             })
             .collect()
+    }
+
+    fn result(&self, _skill: &str, name: &str) -> Result<Option<String>, String> {
+        match name {
+            "Width" => Ok(None),
+            other => Err(format!("no result {other}")),
+        }
+    }
+
+    fn connects(&self, _from: (&str, &str), _to: (&str, &str)) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn used_by_others(&self, run: &str) -> BTreeMap<String, String> {
+        let mut leases = self.leases.lock().unwrap().clone();
+        leases.retain(|_, holder| holder != run);
+        leases
+    }
+
+    fn lease(&self, run: &str, components: &BTreeSet<String>) -> bool {
+        let mut leases = self.leases.lock().unwrap();
+        let is_used = |component| leases.get(component).is_some_and(|holder| holder != run);
+        if components.iter().any(is_used) {
+            return false;
+        }
+        leases.retain(|_, holder| holder != run);
+        let taken = components.iter().map(|one| (one.clone(), run.to_owned()));
+        leases.extend(taken);
+        self.changed.send_modify(|changes| *changes += 1);
+        true
     }
 
     fn keep(&self, run: &Run) {
@@ -254,6 +286,7 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         journal: Mutex::default(),
         kept: Mutex::default(),
         clock: AtomicU64::new(1000),
+        leases: Mutex::default(),
         spare: Mutex::default(),
     }
 }
@@ -600,6 +633,7 @@ async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
         name: "Force".into(),
         value: 12.into(),
         unit: None,
+        result: None,
     });
     let (run, fakes, _) = executed(plant(gripper("gripper")), &process).await;
     assert_eq!(run.outcome, How::Done, "{run:?}");
@@ -724,4 +758,279 @@ async fn what_became_of_a_run_can_be_asked_for() {
         .collect();
     assert_eq!(lost, ["urn:example:gripper#Grasp"]);
     assert_eq!(knowledge.ask("processes", &[]).unwrap().rows.len(), 6);
+}
+
+/// A step of a sequence that a skill of a type does.
+fn alone(number: usize, name: &str, of: &str) -> Step {
+    Step {
+        name: name.into(),
+        needs: vec![Need {
+            role: Role::Alone(number),
+            capability: None,
+            skill_type: Some(TypeName::own(of)),
+        }],
+        ..Step::default()
+    }
+}
+
+/// The compensation of a step, by the same component.
+fn undone_by(of: usize, of_all: usize, skill_type: &str) -> Option<Box<Step>> {
+    let step = alone(of_all + of, &format!("compensation {of}"), skill_type);
+    Some(Box::new(Step {
+        by: By::SameAs(of),
+        ..step
+    }))
+}
+
+/// A process that grasps, moves and drills; the first two steps can be undone.
+fn drills() -> Process {
+    let mut steps = vec![
+        alone(0, "grip", "GraspSkillType"),
+        alone(1, "move", "LinearMoveSkillType"),
+        alone(2, "drill", "DrillSkillType"),
+    ];
+    steps[0].compensation = undone_by(0, 3, "ReleaseSkillType");
+    steps[1].compensation = undone_by(1, 3, "PtpMoveSkillType");
+    Process { steps, ..grasps() }
+}
+
+fn drilling(names: &[&str]) -> Fakes {
+    let drills = names
+        .iter()
+        .map(|name| offer(name, "Drill", "DrillSkillType"));
+    plant(gripper("gripper").into_iter().chain(drills).collect())
+}
+
+#[tokio::test]
+async fn completed_steps_are_compensated_in_reverse_order() {
+    let mut fakes = drilling(&["drill"]);
+    fakes.fails_at = Some("drill.Drill");
+    let (run, fakes, told) = executed(fakes, &drills()).await;
+    let journal = [
+        "gripper.Grasp",
+        "robot.Lin",
+        "drill.Drill",
+        "closed",
+        "robot.Ptp",
+        "closed",
+        "gripper.Release",
+        "closed",
+    ];
+    assert_eq!(*fakes.journal.lock().unwrap(), journal);
+    assert_eq!(run.outcome, How::Failed);
+    let reason = run.reason.clone().unwrap();
+    let ends = reason.ends_with("; compensated: `move`, `grip`");
+    assert!(
+        reason.starts_with("drill: drill.Drill nothing was gripped") && ends,
+        "{reason}"
+    );
+    let [plan, undo] = run.plans.as_slice() else {
+        panic!("{run:?}")
+    };
+    assert_eq!((plan.outcome, undo.outcome), (How::Failed, How::Done));
+    let of = |ran: &crate::record::Ran| (ran.step.clone(), ran.of.clone());
+    let pair = |step: &str, of: &str| (step.to_owned(), of.to_owned());
+    let expected = [
+        pair("compensation 1", "move"),
+        pair("compensation 0", "grip"),
+    ];
+    assert_eq!(undo.ran.iter().map(of).collect::<Vec<_>>(), expected);
+    assert!(undo.compensates && told.contains(&"Compensate"));
+    assert!(fakes.leases.lock().unwrap().is_empty());
+    let knowledge = Knowledge::new().unwrap();
+    let source = Source::new(SourceKind::Run, &run.run);
+    knowledge.replace(&source, &run.triples(), 1).unwrap();
+    let rows = knowledge.ask("run-steps", &[]).unwrap().rows;
+    let undone = rows.iter().filter(|row| row["compensates"] == true);
+    assert_eq!(undone.count(), 2, "{rows:?}");
+}
+
+#[tokio::test]
+async fn a_compensation_with_an_unknown_outcome_stops_the_others() {
+    let ends = [
+        (
+            Ok(failed("halted; the outcome is unknown: no answer")),
+            How::Unknown,
+        ),
+        (Ok(failed("it is jammed")), How::Failed),
+    ];
+    for (end, outcome) in ends {
+        let mut fakes = drilling(&["drill"]);
+        fakes.fails_at = Some("drill.Drill");
+        fakes.ends = Some(("robot.Ptp", Some(end)));
+        let (run, fakes, _) = executed(fakes, &drills()).await;
+        assert_eq!(run.outcome, outcome, "{run:?}");
+        let reason = run.reason.unwrap();
+        let said = reason.contains("the compensation of `move` failed: compensation 1: robot.Ptp");
+        assert!(
+            said && reason.contains("not compensated: `grip`"),
+            "{reason}"
+        );
+        assert_eq!(run.plans[1].outcome, outcome);
+        let journal = fakes.journal.lock().unwrap();
+        assert!(
+            !journal.contains(&"gripper.Release".to_owned()),
+            "{journal:?}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn nothing_is_compensated_while_a_skill_may_go_on_or_after_a_stop() {
+    let unknown = Ok(failed("halted; the outcome is unknown: no answer"));
+    let lost = Err(SkillFault::Lost("the connection broke".into()));
+    for end in [unknown, lost] {
+        let mut fakes = drilling(&["drill", "other"]);
+        fakes.ends = Some(("drill.Drill", Some(end)));
+        let (run, fakes, _) = executed(fakes, &drills()).await;
+        let reason = run.reason.unwrap();
+        let said = "not compensated, because the end of a skill is not confirmed: `move`, `grip`";
+        assert!(reason.contains(said), "{reason}");
+        assert_eq!(
+            fakes.journal.lock().unwrap().len(),
+            4,
+            "no other drill repeats the step"
+        );
+    }
+    // The drill does not end by itself.
+    let mut fakes = drilling(&[]);
+    fakes.ends = None;
+    let slow = Process {
+        wait: Duration::from_secs(600),
+        ..drills()
+    };
+    let mut slow = slow;
+    slow.steps[2].needs[0].skill_type = Some(TypeName::own("PtpMoveSkillType"));
+    let fakes = Arc::new(Fakes {
+        halted_at: Mutex::new(Some("robot.Ptp")),
+        ..fakes
+    });
+    let as_plant: Arc<dyn Plant> = Arc::new(Arc::clone(&fakes));
+    let teller = StopAt("Third", watch::channel(false).0);
+    let counted = Third(teller, AtomicU64::new(0));
+    let run = execute(&as_plant, &slow, 1, &counted);
+    let run = tokio::time::timeout(Duration::from_secs(20), run)
+        .await
+        .unwrap();
+    let reason = run.reason.unwrap();
+    assert!(
+        reason.contains("not compensated, because it was stopped: `move`, `grip`"),
+        "{reason}"
+    );
+}
+
+/// Stops the run at its third step.
+struct Third(StopAt, AtomicU64);
+
+#[async_trait]
+impl Teller for Third {
+    async fn step(&self, step: &'static str) {
+        if step == "Step" && self.1.fetch_add(1, Ordering::Relaxed) == 2 {
+            self.0.step("Third").await;
+        }
+    }
+
+    async fn stopped(&self) {
+        self.0.stopped().await;
+    }
+}
+
+#[tokio::test]
+async fn a_failed_step_is_planned_anew_and_completed_steps_are_not_repeated() {
+    let mut fakes = drilling(&["a-drill", "b-drill"]);
+    fakes.fails_at = Some("a-drill.Drill");
+    let (run, fakes, _) = executed(fakes, &drills()).await;
+    assert_eq!((run.outcome, run.plans.len()), (How::Done, 2), "{run:?}");
+    let journal = [
+        "gripper.Grasp",
+        "robot.Lin",
+        "a-drill.Drill",
+        "closed",
+        "b-drill.Drill",
+        "closed",
+    ];
+    assert_eq!(*fakes.journal.lock().unwrap(), journal);
+    // The component of a step that has not begun is lost: nothing can go on.
+    let fakes = drilling(&["a-drill", "b-drill"]);
+    fakes
+        .lost
+        .send_modify(|lost| lost.push("urn:example:a-drill".into()));
+    let (run, fakes, _) = executed(fakes, &drills()).await;
+    assert_eq!((run.outcome, run.plans.len()), (How::Done, 2), "{run:?}");
+    assert!(
+        !fakes
+            .journal
+            .lock()
+            .unwrap()
+            .contains(&"a-drill.Drill".to_owned())
+    );
+}
+
+#[tokio::test]
+async fn a_result_of_a_step_is_a_parameter_of_a_later_step() {
+    let mut process = drills();
+    process.steps[2].parameters = vec![Given {
+        name: "Depth".into(),
+        value: serde_json::Value::Null,
+        unit: None,
+        result: Some(ResultOf {
+            step: 0,
+            name: "Width".into(),
+        }),
+    }];
+    let (run, ..) = executed(drilling(&["drill"]), &process).await;
+    assert_eq!(run.outcome, How::Done, "{run:?}");
+    let drill = run.plans[0].ran.last().unwrap();
+    assert_eq!(drill.parameters["Depth"], 0.03);
+    // A skill that breaks its description gives no value: the run fails and is compensated.
+    process.steps[2].parameters[0].result = Some(ResultOf {
+        step: 1,
+        name: "Width".into(),
+    });
+    let (run, ..) = executed(drilling(&["drill"]), &process).await;
+    let reason = run.reason.unwrap();
+    let said = reason.contains("drill: Depth: Lin returned no result Width");
+    assert!(
+        said && reason.ends_with("compensated: `move`, `grip`"),
+        "{reason}"
+    );
+}
+
+#[tokio::test]
+async fn two_processes_run_at_a_time_and_the_second_waits_for_a_component_in_use() {
+    let fakes = Arc::new(drilling(&["drill"]));
+    let as_plant: Arc<dyn Plant> = Arc::new(Arc::clone(&fakes));
+    let other = "urn:run:other".to_owned();
+    fakes
+        .leases
+        .lock()
+        .unwrap()
+        .insert("urn:example:drill".to_owned(), other);
+    let told = |_: &'static str| {};
+    let process = Process {
+        wait: Duration::from_secs(10),
+        ..drills()
+    };
+    let run = execute(&as_plant, &process, 1, &told);
+    let free = async {
+        let waits = || {
+            let kept = fakes.kept.lock().unwrap();
+            kept.last().and_then(|run| run.waits_for.clone())
+        };
+        let waits_for = loop {
+            match waits() {
+                Some(waits_for) => break waits_for,
+                None => tokio::task::yield_now().await,
+            }
+        };
+        assert!(
+            waits_for.contains("the run urn:run:other uses its component"),
+            "{waits_for}"
+        );
+        assert!(fakes.journal.lock().unwrap().is_empty());
+        Plant::lease(&fakes, "urn:run:other", &BTreeSet::new());
+    };
+    let (run, ()) = tokio::join!(run, free);
+    assert_eq!(run.outcome, How::Done, "{run:?}");
+    assert!(fakes.leases.lock().unwrap().is_empty());
 }

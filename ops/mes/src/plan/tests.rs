@@ -3,7 +3,7 @@ use std::time::Duration;
 use skills::TypeName;
 
 use super::*;
-use crate::process::{Given, Job, Step};
+use crate::process::{Given, Job, ResultOf, Step};
 
 const GRASP: &str = "urn:example:capability:grasp";
 const RELEASE: &str = "urn:example:capability:release";
@@ -17,8 +17,46 @@ fn need(role: Role, capability: &str) -> Need {
     }
 }
 
+/// Facts by which each skill takes all parameters, but those of a component at a step, and has the
+/// results whose names begin with its own.
+struct Known {
+    refuses: (&'static str, &'static str),
+}
+
+impl Facts for Known {
+    fn takes(&self, offer: &Offer, step: &Step) -> Result<(), String> {
+        match self.refuses == (&*offer.component_name, &*step.name) {
+            true => Err(format!("{} has no parameter Nonsense", offer.name)),
+            false => Ok(()),
+        }
+    }
+
+    fn gives(&self, offer: &Offer, result: &str) -> Result<(), String> {
+        match result.starts_with(&offer.name) {
+            true => Ok(()),
+            false => Err(format!("{} has no result {result}", offer.name)),
+        }
+    }
+
+    fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
+        match to.1 == "Text" {
+            true => Err(format!("{} is a number", from.1)),
+            false => Ok(()),
+        }
+    }
+}
+
+const KNOWN: Known = Known { refuses: ("", "") };
+
+fn situation(fallen: &[Fallen]) -> Situation<'_> {
+    Situation {
+        fallen,
+        ..Situation::default()
+    }
+}
+
 fn plan(process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Plan {
-    super::plan(process, offers, fallen, &|_, _| Ok(()))
+    super::plan(process, offers, situation(fallen), &KNOWN)
 }
 
 /// A process that picks a part and places it.
@@ -371,6 +409,7 @@ fn the_attached_tool_does_what_it_can() {
         name: "ToolAppUri".into(),
         value: "urn:example:vacuum".into(),
         unit: None,
+        result: None,
     }];
     let attached = plan(&process, &offers, &[]);
     let expected = [
@@ -409,18 +448,144 @@ fn the_attached_tool_does_what_it_can() {
 fn a_skill_that_cannot_take_the_parameters_of_a_step_is_not_chosen() {
     let offers = [gripper("finger"), gripper("vacuum")].concat();
     let process = sequence(&[GRASP, RELEASE]);
-    let check = |offer: &Offer, step: &Step| {
-        let is_refused = offer.component_name == "finger" && step.name == "step 1";
-        if is_refused {
-            Err("Release has no parameter Nonsense".to_owned())
-        } else {
-            Ok(())
-        }
+    let known = Known {
+        refuses: ("finger", "step 1"),
     };
-    let two = super::plan(&process, &offers, &[], &check);
+    let two = super::plan(&process, &offers, Situation::default(), &known);
     assert_eq!(chosen(&two, 2), ["vacuum#Grasp", "vacuum#Release"]);
-    let one = super::plan(&process, &offers[..2], &[], &check);
+    let one = super::plan(&process, &offers[..2], Situation::default(), &known);
     assert!(!one.is_complete());
     let expected = "finger.Release: Release has no parameter Nonsense";
     assert!(one.missing().contains(expected), "{}", one.missing());
+}
+
+/// A parameter that is a result of a step.
+fn result_of(step: usize, name: &str, parameter: &str) -> Given {
+    Given {
+        name: parameter.into(),
+        value: serde_json::Value::Null,
+        unit: None,
+        result: Some(ResultOf {
+            step,
+            name: name.into(),
+        }),
+    }
+}
+
+#[test]
+fn a_skill_without_the_result_that_a_later_step_takes_is_not_chosen() {
+    let mut plain = gripper("a-plain");
+    plain[0].name = "Hold".into();
+    let offers = [plain, gripper("gripper")].concat();
+    let mut process = sequence(&[GRASP, RELEASE]);
+    process.steps[1].parameters = vec![result_of(0, "GraspWidth", "Width")];
+    let found = plan(&process, &offers, &[]);
+    assert_eq!(chosen(&found, 2), ["gripper#Grasp", "gripper#Release"]);
+    let expected = "Hold has no result GraspWidth";
+    assert_eq!(why(&found, Role::Alone(0), "a-plain#Grasp"), expected);
+    // A result of another type is a reason too.
+    process.steps[1].parameters[0].name = "Text".into();
+    let found = plan(&process, &offers, &[]);
+    assert!(!found.is_complete());
+    let expected = "Text: GraspWidth is a number";
+    assert_eq!(why(&found, Role::Alone(1), "gripper#Release"), expected);
+}
+
+/// The compensation of the step with a number in a process of two steps.
+fn compensation(number: usize, capability: &str) -> Option<Box<Step>> {
+    let role = Role::Alone(2 + number);
+    let need = Need {
+        role,
+        capability: Some(capability.into()),
+        skill_type: None,
+    };
+    Some(Box::new(Step {
+        name: format!("compensation of step {number}"),
+        needs: vec![need],
+        by: By::SameAs(number),
+        ..Step::default()
+    }))
+}
+
+#[test]
+fn a_component_that_cannot_undo_its_step_is_not_chosen() {
+    let grasps = gripper("a-grasps").into_iter().take(1).collect();
+    let offers = [grasps, gripper("gripper"), robot("robot")].concat();
+    let mut process = sequence(&[GRASP, MOVE]);
+    let without = plan(&process, &offers, &[]);
+    assert_eq!(chosen(&without, 1), ["a-grasps#Grasp"]);
+    process.steps[0].compensation = compensation(0, RELEASE);
+    let with = plan(&process, &offers, &[]);
+    assert!(with.is_complete(), "{}", with.missing());
+    assert_eq!(
+        chosen(&with, 3),
+        ["gripper#Grasp", "robot#Lin", "gripper#Release"]
+    );
+    let expected =
+        "it would fit, but its component has nothing for the step `compensation of step 0`";
+    assert_eq!(why(&with, Role::Alone(0), "a-grasps#Grasp"), expected);
+}
+
+#[test]
+fn a_step_that_is_done_keeps_its_component_in_the_next_plan() {
+    let offers = [gripper("a"), gripper("b"), robot("robot")].concat();
+    let process = sequence(&[GRASP, MOVE, RELEASE]);
+    let kept = [Kept {
+        number: 0,
+        offer: offers[2].clone(),
+    }];
+    let with = |offers: &[Offer]| {
+        let situation = Situation {
+            kept: &kept,
+            ..Situation::default()
+        };
+        super::plan(&process, offers, situation, &KNOWN)
+    };
+    let next = with(&offers);
+    assert_eq!(chosen(&next, 3), ["b#Grasp", "robot#Lin", "b#Release"]);
+    let expected = "b has done the step `step 0`, and has to do this one too";
+    assert_eq!(why(&next, Role::Alone(2), "a#Release"), expected);
+    // The component was lost meanwhile, and may not hold the part any more.
+    let mut anew = offers.clone();
+    anew[2].since_ms = 99;
+    anew[3].since_ms = 99;
+    let next = with(&anew);
+    assert_eq!(chosen(&next, 3), ["b#Grasp", "robot#Lin", "none"]);
+    assert!(!next.is_complete() && next.is_hopeless());
+    let expected = "its component was lost after it had done the step `step 0`";
+    assert_eq!(why(&next, Role::Alone(2), "b#Release"), expected);
+    // A missing robot may come.
+    let next = with(&offers[..4]);
+    assert!(!next.is_complete() && !next.is_hopeless());
+}
+
+#[test]
+fn a_component_that_another_run_uses_is_not_chosen_and_an_attached_tool_stays_attached() {
+    let offers = [gripper("a"), gripper("b")].concat();
+    let used = BTreeMap::from([("urn:example:a".to_owned(), "urn:run:1".to_owned())]);
+    let with = |process: &Process| {
+        let situation = Situation {
+            used: Some(&used),
+            ..Situation::default()
+        };
+        super::plan(process, &offers, situation, &KNOWN)
+    };
+    let found = with(&sequence(&[GRASP, RELEASE]));
+    assert_eq!(chosen(&found, 2), ["b#Grasp", "b#Release"]);
+    let expected = "it would fit, but the run urn:run:1 uses its component";
+    assert_eq!(why(&found, Role::Alone(0), "a#Grasp"), expected);
+    let mut process = sequence(&["urn:change", GRASP]);
+    process.steps[0].needs[0].skill_type = Some(TypeName::own("ChangeToolSkillType"));
+    process.steps[0].parameters = vec![Given {
+        name: "ToolAppUri".into(),
+        value: "urn:example:a".into(),
+        unit: None,
+        result: None,
+    }];
+    let found = with(&process);
+    assert_eq!(
+        chosen(&found, 2)[1],
+        "none",
+        "the other gripper is not attached"
+    );
 }

@@ -63,6 +63,7 @@ fn steps_that_are_done_by_themselves_have_parameters() {
         name: name.to_owned(),
         value,
         unit: unit.map(str::to_owned),
+        result: None,
     };
     let expected = [
         given("Force", serde_json::json!(12.5), None),

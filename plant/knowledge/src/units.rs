@@ -1,8 +1,12 @@
-//! Units of measurement: conversion of numbers between units of one quantity.
+//! Units of measurement: conversion of numbers between units of one quantity, in programs and in
+//! queries.
+
+use mtp::{Object, Triple, vocabulary as v};
 
 /// Converts a number between two units, given by their symbols; `None` if they do not measure the
 /// same quantity.
-pub(crate) fn convert(number: f64, from: &str, to: &str) -> Option<f64> {
+#[must_use]
+pub fn convert(number: f64, from: &str, to: &str) -> Option<f64> {
     let (from, to) = (from.trim(), to.trim());
     if from == to {
         return Some(number);
@@ -13,6 +17,30 @@ pub(crate) fn convert(number: f64, from: &str, to: &str) -> Option<f64> {
     };
     let ((quantity, factor, zero), (wanted, by, from_zero)) = (of(from)?, of(to)?);
     (quantity == wanted).then(|| ((number * factor + zero) - from_zero) / by)
+}
+
+/// Returns the units as statements, so that queries can convert numbers: a number times
+/// `ua:factor` plus `ua:zero` is in the SI unit of the quantity.
+#[must_use]
+pub fn triples() -> Vec<Triple> {
+    let mut all = Vec::new();
+    for (number, (symbols, quantity, factor, zero)) in UNITS.iter().enumerate() {
+        let subject = format!("urn:ua-bridge:unit:{number}");
+        let mut say = |predicate: &str, object| {
+            all.push(Triple {
+                subject: subject.clone(),
+                predicate: predicate.to_owned(),
+                object,
+            });
+        };
+        for symbol in *symbols {
+            say(v::SYMBOL, Object::Text((*symbol).to_owned()));
+        }
+        say(v::QUANTITY, Object::Text(format!("{quantity:?}")));
+        say(v::FACTOR, Object::Number(*factor));
+        say(v::ZERO, Object::Number(*zero));
+    }
+    all
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

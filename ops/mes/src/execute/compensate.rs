@@ -1,0 +1,173 @@
+//! Compensation: the completed steps of a run that failed are undone, the last one first.
+
+use skills::Value;
+use tracing::{info, warn};
+
+use super::{Execution, Plant, StepEnd, close};
+use crate::plan::{Kept, Offer, Plan};
+use crate::process::{Given, Process, Step};
+use crate::record::{How, Planned, Run};
+
+/// A completed step.
+#[derive(Debug, Clone)]
+pub(super) struct Done {
+    pub(super) number: usize,
+    pub(super) offer: Offer,
+    /// The skill of its compensation, if it has one.
+    pub(super) undo: Option<Offer>,
+    pub(super) results: Vec<(String, Value)>,
+}
+
+/// Returns the choices that later plans keep: those of completed steps and of their compensations.
+pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<Kept> {
+    let one = |done: &Done| {
+        let undo = done.undo.clone().map(|offer| Kept {
+            number: process.compensation_of(done.number),
+            offer,
+        });
+        let step = Kept {
+            number: done.number,
+            offer: done.offer.clone(),
+        };
+        std::iter::once(step).chain(undo).collect::<Vec<_>>()
+    };
+    done.iter().flat_map(one).collect()
+}
+
+/// Returns the parameters of a step, with the results of completed steps in them.
+///
+/// # Errors
+/// The result that a step did not return.
+pub(super) fn resolved(
+    plant: &dyn Plant,
+    step: &Step,
+    done: &[Done],
+) -> Result<Vec<Given>, String> {
+    let one = |given: &Given| {
+        let Some(of) = &given.result else {
+            return Ok(given.clone());
+        };
+        let from = done.iter().find(|done| done.number == of.step);
+        let from = from.ok_or_else(|| format!("{}: its step is not done", given.name))?;
+        let mut results = from.results.iter();
+        let value = results.find(|(name, _)| *name == of.name);
+        let (_, value) = value.ok_or_else(|| {
+            let skill = &from.offer.name;
+            format!("{}: {skill} returned no result {}", given.name, of.name)
+        })?;
+        Ok(Given {
+            name: given.name.clone(),
+            value: value.to_json(),
+            unit: plant.result(&from.offer.skill, &of.name)?,
+            result: None,
+        })
+    };
+    step.parameters.iter().map(one).collect()
+}
+
+impl Execution<'_> {
+    /// Compensates the completed steps of a run that failed, and adds what was done to the reason.
+    ///
+    /// Nothing is compensated after the caller stopped the run, and while the end of a skill is not
+    /// confirmed: its machine may still move.
+    pub(super) async fn compensated(&self, why: String, done: &[Done]) -> String {
+        let undone = done.iter().rev().filter_map(|done| {
+            let step = self.process.steps.get(done.number)?;
+            let compensation = step.compensation.as_deref()?;
+            Some((step, compensation, done.undo.as_ref()?))
+        });
+        let undone: Vec<(&Step, &Step, &Offer)> = undone.collect();
+        if undone.is_empty() {
+            return why;
+        }
+        let names = |steps: &[(&Step, &Step, &Offer)]| {
+            let names = steps.iter().map(|(step, ..)| format!("`{}`", step.name));
+            names.collect::<Vec<_>>().join(", ")
+        };
+        let not = match (self.is_stopped().await, is_open(&self.log.run())) {
+            (true, _) => Some("it was stopped"),
+            (_, true) => Some("the end of a skill is not confirmed"),
+            (false, false) => None,
+        };
+        if let Some(reason) = not {
+            return format!(
+                "{why}; not compensated, because {reason}: {}",
+                names(&undone)
+            );
+        }
+        let plan = Plan::of(undone.iter().map(|(_, step, offer)| (*step, *offer)));
+        self.log.change(|kept, now| {
+            kept.run.waits_for = None;
+            let number = kept.run.plans.len().saturating_add(1);
+            kept.run.plans.push(Planned {
+                compensates: true,
+                ..Planned::begins(number, now, plan)
+            });
+        });
+        for (position, (step, compensation, offer)) in undone.iter().enumerate() {
+            let Err(fault) = self.undo(compensation, offer, done).await else {
+                info!(step = step.name, "a step is compensated");
+                continue;
+            };
+            warn!(
+                step = step.name,
+                "the compensation of a step failed: {fault}"
+            );
+            let reason = format!("the compensation of `{}` failed: {fault}", step.name);
+            self.end(How::Failed, Some(reason.clone()));
+            let left = undone.get(position.saturating_add(1)..).unwrap_or_default();
+            let left = match left {
+                [] => String::new(),
+                left => format!("; not compensated: {}", names(left)),
+            };
+            return format!("{why}; {reason}{left}");
+        }
+        self.end(How::Done, None);
+        format!("{why}; compensated: {}", names(&undone))
+    }
+
+    /// Runs the skill of a compensation.
+    async fn undo(&self, step: &Step, offer: &Offer, done: &[Done]) -> Result<(), String> {
+        self.teller.step("Compensate").await;
+        let opened = self.open(std::slice::from_ref(offer)).await;
+        let (opened, skills) = opened.map_err(|fault| {
+            let name = &offer.component_name;
+            format!("{name} cannot be reached: {}", fault.why)
+        })?;
+        let ended = match skills.first() {
+            Some(skill) => self.one(step, (offer, &**skill), done).await,
+            None => StepEnd::Failed("its skill is gone".to_owned()),
+        };
+        close(opened).await;
+        match ended {
+            StepEnd::Done(_) => Ok(()),
+            StepEnd::Failed(why)
+            | StepEnd::Lost(why)
+            | StepEnd::Stopped(why)
+            | StepEnd::Unresolved(why) => Err(why),
+        }
+    }
+
+    fn end(&self, outcome: How, reason: Option<String>) {
+        self.log.change(|kept, now| {
+            if let Some(plan) = kept.run.plan() {
+                plan.end(now, outcome, reason);
+            }
+        });
+    }
+
+    /// Returns whether the caller has stopped the run.
+    async fn is_stopped(&self) -> bool {
+        tokio::select! {
+            biased;
+            () = self.teller.stopped() => true,
+            () = std::future::ready(()) => false,
+        }
+    }
+}
+
+/// Returns whether the end of a skill is not confirmed.
+fn is_open(run: &Run) -> bool {
+    let mut ran = run.plans.iter().flat_map(|plan| &plan.ran);
+    ran.any(|ran| matches!(ran.outcome, How::Running | How::Unknown | How::Lost))
+}

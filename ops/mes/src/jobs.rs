@@ -1,0 +1,181 @@
+//! Jobs: runs of processes that clients start over HTTP, several at a time.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use async_trait::async_trait;
+use serde::Serialize;
+use skills::Teller;
+use tokio::runtime::Handle;
+use tokio::sync::watch;
+
+use crate::cell::{Cell, now};
+use crate::execute::{Plant, execute};
+use crate::record::{How, Run};
+
+/// The jobs.
+pub(crate) struct Jobs {
+    cell: Arc<Cell>,
+    runtime: Handle,
+    all: Arc<Mutex<BTreeMap<u64, Job>>>,
+}
+
+/// A job.
+#[derive(Debug, Clone, Serialize)]
+struct Job {
+    job: u64,
+    process: String,
+    outcome: How,
+    /// The current step of a running job.
+    step: Option<String>,
+    /// The missing components that it waits for.
+    waits_for: Option<String>,
+    reason: Option<String>,
+    /// The IRI of its run in the graph.
+    run: Option<String>,
+    started_ms: u64,
+    ended_ms: Option<u64>,
+    /// Components that no other run may use, because the outcome is unknown.
+    holds: Vec<String>,
+    #[serde(skip)]
+    stop: watch::Sender<bool>,
+}
+
+impl Jobs {
+    /// Creates the jobs of a plant, which run in this runtime.
+    pub(crate) fn new(cell: Arc<Cell>, runtime: Handle) -> Self {
+        Self {
+            cell,
+            runtime,
+            all: Arc::default(),
+        }
+    }
+}
+
+impl knowledge::Jobs for Jobs {
+    fn start(&self, process: &str) -> Result<Option<u64>, String> {
+        let process = self.cell.process(process)?;
+        let number = self.cell.next_run();
+        let (stop, stopped) = watch::channel(false);
+        {
+            let mut all = locked(&self.all);
+            let running = all.values().filter(|job| job.outcome == How::Running);
+            if running.count() >= MOST_AT_ONCE {
+                return Ok(None);
+            }
+            let job = Job {
+                job: number,
+                process: process.iri.clone(),
+                outcome: How::Running,
+                step: None,
+                waits_for: None,
+                reason: None,
+                run: None,
+                started_ms: now(),
+                ended_ms: None,
+                holds: Vec::new(),
+                stop,
+            };
+            all.insert(number, job);
+            while all.len() > MOST_JOBS {
+                let mut ended = all.values().filter(|job| job.is_over());
+                let Some(oldest) = ended.next().map(|job| job.job) else {
+                    break;
+                };
+                all.remove(&oldest);
+            }
+        }
+        let (cell, all) = (Arc::clone(&self.cell), Arc::clone(&self.all));
+        drop(self.runtime.spawn(async move {
+            let telling = Telling {
+                number,
+                all: Arc::clone(&all),
+                stopped,
+            };
+            let plant: Arc<dyn Plant> = Arc::clone(&cell) as Arc<dyn Plant>;
+            let run = execute(&plant, &process, number, &telling).await;
+            let holds = cell.used_by(&run.run);
+            ended(&all, number, run, holds);
+        }));
+        Ok(Some(number))
+    }
+
+    fn stop(&self, number: u64) -> bool {
+        let run = {
+            let mut all = locked(&self.all);
+            let Some(job) = all.get_mut(&number) else {
+                return false;
+            };
+            job.stop.send_replace(true);
+            job.holds.clear();
+            job.run.clone().filter(|_| job.outcome == How::Unknown)
+        };
+        if let Some(run) = run {
+            self.cell.give_back(&run);
+        }
+        true
+    }
+
+    fn list(&self) -> serde_json::Value {
+        let mut jobs: Vec<Job> = locked(&self.all).values().cloned().collect();
+        for run in self.cell.runs() {
+            let number = run.number();
+            if let Some(job) = jobs.iter_mut().find(|job| Some(job.job) == number) {
+                job.waits_for.clone_from(&run.waits_for);
+                job.run = Some(run.run);
+            }
+        }
+        serde_json::json!({ "jobs": jobs })
+    }
+}
+
+impl Job {
+    /// Returns whether it has ended and holds no components.
+    fn is_over(&self) -> bool {
+        self.outcome != How::Running && self.holds.is_empty()
+    }
+}
+
+fn ended(all: &Mutex<BTreeMap<u64, Job>>, number: u64, run: Run, holds: Vec<String>) {
+    if let Some(job) = locked(all).get_mut(&number) {
+        job.outcome = run.outcome;
+        job.reason = run.reason;
+        job.run = Some(run.run);
+        job.ended_ms = run.ended_ms;
+        job.step = None;
+        job.holds = holds;
+    }
+}
+
+fn locked(all: &Mutex<BTreeMap<u64, Job>>) -> MutexGuard<'_, BTreeMap<u64, Job>> {
+    all.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Keeps the step of a job, and stops its run on request.
+struct Telling {
+    number: u64,
+    all: Arc<Mutex<BTreeMap<u64, Job>>>,
+    stopped: watch::Receiver<bool>,
+}
+
+#[async_trait]
+impl Teller for Telling {
+    async fn step(&self, step: &'static str) {
+        if let Some(job) = locked(&self.all).get_mut(&self.number) {
+            job.step = Some(step.to_owned());
+        }
+    }
+
+    async fn stopped(&self) {
+        let mut stopped = self.stopped.clone();
+        if stopped.wait_for(|stopped| *stopped).await.is_err() {
+            // The job was removed from the list, which only happens after its end.
+            std::future::pending::<()>().await;
+        }
+    }
+}
+
+/// Maximum number of running jobs.
+const MOST_AT_ONCE: usize = 16;
+/// Maximum number of jobs; the oldest ended jobs are removed.
+const MOST_JOBS: usize = 100;

@@ -1,0 +1,391 @@
+//! The judgement of offers for the needs of a process, with reasons.
+
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+
+use skills::TypeName;
+
+use super::{Candidate, Facts, Offer, Plan, PlannedNeed, Situation, Team, is_exact};
+use crate::process::{By, Group, Job, Need, Process, Role, Step};
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum NotFit {
+    Unrelated,
+    Because(String),
+}
+
+/// The judgement of offers for a process.
+pub(super) struct Judging<'a> {
+    process: &'a Process,
+    situation: Situation<'a>,
+    facts: &'a dyn Facts,
+    /// The tools that have to fill roles, with the steps that attach them.
+    tools: BTreeMap<Role, Option<Attached>>,
+    /// The completed steps whose components have to fill roles.
+    bound: BTreeMap<Role, Bound<'a>>,
+}
+
+/// A completed step, and the component that did it.
+#[derive(Debug, Clone, Copy)]
+struct Bound<'a> {
+    step: &'a str,
+    offer: &'a Offer,
+}
+
+impl Bound<'_> {
+    /// Returns whether an offer is of the component as it did the step. A component that was lost
+    /// meanwhile may have lost the effect of the step.
+    fn is_it(&self, offer: &Offer) -> bool {
+        self.offer.component == offer.component && self.offer.since_ms == offer.since_ms
+    }
+
+    /// Returns the reason why an offer of another component cannot fill the role.
+    fn why(&self, offer: &Offer) -> String {
+        let (step, name) = (self.step, &self.offer.component_name);
+        match self.offer.component == offer.component {
+            true => format!("its component was lost after it had done the step `{step}`"),
+            false => format!("{name} has done the step `{step}`, and has to do this one too"),
+        }
+    }
+}
+
+/// A tool by its IRI, and the name of the step that attaches it.
+type Attached = (String, String);
+
+impl<'a> Judging<'a> {
+    pub(super) const fn new(
+        process: &'a Process,
+        situation: Situation<'a>,
+        facts: &'a dyn Facts,
+    ) -> Self {
+        Self {
+            process,
+            situation,
+            facts,
+            tools: BTreeMap::new(),
+            bound: BTreeMap::new(),
+        }
+    }
+
+    /// Requires the tools that steps attach for the steps that they can do.
+    pub(super) fn require_tools(&mut self, offers: &[Offer]) {
+        self.tools = self.attached_tools(offers);
+    }
+
+    /// Returns whether an offer fits a need, and no other run uses its component.
+    pub(super) fn fits(&self, need: &Need, offer: &Offer) -> bool {
+        self.judge(need, offer).is_ok() && self.used(offer).is_none()
+    }
+
+    /// Returns whether a completed step does not exclude the offer for a role.
+    pub(super) fn is_allowed(&self, role: Role, offer: &Offer) -> bool {
+        let bound = self.bound.get(&role);
+        bound.is_none_or(|bound| bound.is_it(offer))
+    }
+
+    /// Returns the step of a sequence, or the compensation, that has a role.
+    fn step(&self, role: Role) -> Option<&'a Step> {
+        match role {
+            Role::Alone(number) => self.process.step(number),
+            Role::Ptp | Role::Linear | Role::Grasp | Role::Release => None,
+        }
+    }
+
+    /// Returns the offer that an earlier plan chose for a step that is done.
+    pub(super) fn kept(&self, role: Role) -> Option<&'a Offer> {
+        let mut kept = self.situation.kept.iter();
+        let of_role = kept.find(|kept| Role::Alone(kept.number) == role);
+        of_role.map(|kept| &kept.offer)
+    }
+
+    /// Binds the roles of each group with a completed step to its component.
+    pub(super) fn bind(&mut self, groups: &BTreeMap<Role, Group>) {
+        for kept in self.situation.kept {
+            let Some(step) = self.process.steps.get(kept.number) else {
+                continue;
+            };
+            let bound = Bound {
+                step: &step.name,
+                offer: &kept.offer,
+            };
+            let group = groups.get(&Role::Alone(kept.number));
+            for (role, _) in groups.iter().filter(|(_, other)| Some(*other) == group) {
+                self.bound.entry(*role).or_insert(bound);
+            }
+        }
+    }
+
+    /// Takes back the choice of a skill that cannot take the result of another chosen skill.
+    pub(super) fn connect(&self, plan: &mut Plan) {
+        for (number, step) in self.process.numbered() {
+            let taken = step.parameters.iter();
+            for (given, of) in taken.filter_map(|given| Some((given, given.result.as_ref()?))) {
+                let chosen =
+                    |plan: &Plan, number| plan.chosen(Role::Alone(number)).map(str::to_owned);
+                let (Some(from), Some(to)) = (chosen(plan, of.step), chosen(plan, number)) else {
+                    continue;
+                };
+                let connects = self.facts.connects((&from, &of.name), (&to, &given.name));
+                if let Err(why) = connects {
+                    plan.refuse(Role::Alone(number), &format!("{}: {why}", given.name));
+                }
+            }
+        }
+    }
+
+    /// Returns the other run that uses the component of an offer.
+    fn used(&self, offer: &Offer) -> Option<&'a str> {
+        let used = self.situation.used?.get(&offer.component);
+        used.map(String::as_str)
+    }
+
+    /// Returns the results of a step that other steps take.
+    fn taken(&self, role: Role) -> impl Iterator<Item = &'a str> {
+        let given = self.process.numbered();
+        let given = given.flat_map(|(_, step)| &step.parameters);
+        let results = given.filter_map(|given| given.result.as_ref());
+        results
+            .filter(move |of| Role::Alone(of.step) == role)
+            .map(|of| of.name.as_str())
+    }
+
+    /// Returns the tools that have to fill roles: a tool that a step attaches does all later steps
+    /// that it can do, until another tool is attached.
+    fn attached_tools(&self, offers: &[Offer]) -> BTreeMap<Role, Option<Attached>> {
+        let mut tools = BTreeMap::new();
+        if self.process.work != Job::Sequence {
+            return tools;
+        }
+        let mut attached: Option<Attached> = None;
+        for (number, step) in self.process.steps.iter().enumerate() {
+            let role = Role::Alone(number);
+            // A tool that has failed or is in use stays attached.
+            let fits = |offer: &&Offer| {
+                let mut needs = step.needs.iter();
+                needs.all(|need| self.suits(need, offer).is_ok() && self.takes(need, offer).is_ok())
+            };
+            let is_tool = |of: &str| {
+                let of = TypeName::own(of).to_string();
+                let named = step
+                    .needs
+                    .iter()
+                    .filter_map(|need| need.skill_type.as_ref());
+                named.into_iter().any(|named| named.to_string() == of)
+                    || offers
+                        .iter()
+                        .filter(fits)
+                        .any(|offer| offer.types.contains(&of))
+            };
+            if is_tool("AttachToolSkillType") || is_tool("ChangeToolSkillType") {
+                let named = step.parameters.iter().find(|given| given.name == TOOL);
+                attached = named
+                    .and_then(|given| given.value.as_str())
+                    .map(|tool| (tool.to_owned(), step.name.clone()));
+                continue;
+            }
+            let can = |tool: &str| {
+                let mut fitting = offers.iter().filter(fits);
+                fitting.any(|offer| offer.component == tool)
+            };
+            let is_bound = match (&attached, step.by) {
+                (_, By::AttachedTool) => true,
+                (Some((tool, _)), By::Any) => can(tool),
+                (None, By::Any) | (_, By::SameAs(_)) => false,
+            };
+            if is_bound {
+                tools.insert(role, attached.clone());
+            }
+        }
+        tools
+    }
+
+    pub(super) fn planned(
+        &self,
+        need: &Need,
+        offers: &[Offer],
+        team: Option<&Team<'_>>,
+    ) -> PlannedNeed {
+        let chosen = team.and_then(|team| team.chosen.get(&need.role)).copied();
+        if let Some(kept) = self.kept(need.role) {
+            return PlannedNeed::chosen(need, kept, "an earlier plan of this run chose it");
+        }
+        let mut candidates = Vec::new();
+        for offer in offers {
+            let judged = self.judge(need, offer);
+            // Skills with neither the capability nor the type are not listed as candidates.
+            if judged == Err(NotFit::Unrelated) {
+                continue;
+            }
+            let is_chosen = chosen.is_some_and(|chosen| chosen.skill == offer.skill);
+            let why = match judged {
+                Ok(fit) if is_chosen => fit,
+                Ok(_) => self.why_not(need, offer, chosen, team),
+                Err(NotFit::Unrelated) => String::new(),
+                Err(NotFit::Because(why)) => why,
+            };
+            candidates.push(Candidate {
+                skill: offer.skill.clone(),
+                name: offer.name.clone(),
+                component: offer.component.clone(),
+                component_name: offer.component_name.clone(),
+                chosen: is_chosen,
+                why,
+            });
+        }
+        candidates.sort_by(|one, other| {
+            (Reverse(one.chosen), &one.skill).cmp(&(Reverse(other.chosen), &other.skill))
+        });
+        PlannedNeed {
+            role: need.role.name(),
+            capability: need.capability.clone(),
+            skill_type: need.skill_type.as_ref().map(ToString::to_string),
+            chosen: chosen.map(|offer| offer.skill.clone()),
+            candidates,
+            role_is: need.role,
+            is_bound: self.bound.contains_key(&need.role),
+        }
+    }
+
+    /// Checks the capability and the type of an offer.
+    fn suits(&self, need: &Need, offer: &Offer) -> Result<(), NotFit> {
+        let has_capability = need
+            .capability
+            .as_ref()
+            .is_none_or(|wanted| offer.closure.contains(wanted));
+        let has_type = need
+            .skill_type
+            .as_ref()
+            .is_none_or(|wanted| offer.types.contains(&wanted.to_string()));
+        let is_related = (need.capability.is_some() && has_capability)
+            || (need.skill_type.is_some() && has_type);
+        if !is_related {
+            return Err(NotFit::Unrelated);
+        }
+        let because = |why: String| Err(NotFit::Because(why));
+        if !offer.is_skill {
+            return because(
+                "it is a service in a manifest; `ua-component` with `device: {mtp: ..}` runs it as a skill"
+                    .to_owned(),
+            );
+        }
+        if let (false, Some(wanted)) = (has_capability, &need.capability) {
+            let has = if offer.capabilities.is_empty() {
+                "no capability".to_owned()
+            } else {
+                offer.capabilities.join(", ")
+            };
+            return because(format!(
+                "it realises {has}, and none of that is {wanted} or below it"
+            ));
+        }
+        if let (false, Some(wanted)) = (has_type, &need.skill_type) {
+            return because(format!("its type is not {wanted} or below it"));
+        }
+        Ok(())
+    }
+
+    /// Checks that an offer takes the parameters of its step, and has the results that other steps
+    /// take.
+    fn takes(&self, need: &Need, offer: &Offer) -> Result<(), NotFit> {
+        if let Some(step) = self.step(need.role) {
+            self.facts.takes(offer, step).map_err(NotFit::Because)?;
+        }
+        for result in self.taken(need.role) {
+            self.facts.gives(offer, result).map_err(NotFit::Because)?;
+        }
+        Ok(())
+    }
+
+    /// Returns the reason why an offer fits a need, or why it does not.
+    fn judge(&self, need: &Need, offer: &Offer) -> Result<String, NotFit> {
+        self.suits(need, offer)?;
+        let because = |why: String| Err(NotFit::Because(why));
+        let fell = self.situation.fallen.iter().find(|fallen| {
+            fallen.component == offer.component
+                && fallen.since_ms == offer.since_ms
+                && fallen
+                    .skill
+                    .as_ref()
+                    .is_none_or(|skill| *skill == offer.skill)
+        });
+        if let Some(fallen) = fell {
+            return because(fallen.why.clone());
+        }
+        match self.tools.get(&need.role) {
+            Some(None) => return because("no step before it attaches a tool".to_owned()),
+            Some(Some((tool, step))) if *tool != offer.component => {
+                return because(format!(
+                    "it is not of the tool {tool}, which the step `{step}` attaches"
+                ));
+            }
+            Some(Some(_)) | None => {}
+        }
+        self.takes(need, offer)?;
+        let capability = need.capability.as_ref().map(|wanted| {
+            if offer.capabilities.contains(wanted) {
+                format!("it realises {wanted}")
+            } else {
+                format!(
+                    "it realises {}, which is below {wanted}",
+                    offer.capabilities.join(", ")
+                )
+            }
+        });
+        let of_type = need
+            .skill_type
+            .as_ref()
+            .map(|wanted| format!("its type is {} or below it", wanted.name));
+        let reasons: Vec<String> = capability.into_iter().chain(of_type).collect();
+        Ok(reasons.join(", "))
+    }
+
+    /// Returns the reason why a fitting offer is not chosen.
+    fn why_not(
+        &self,
+        need: &Need,
+        offer: &Offer,
+        chosen: Option<&Offer>,
+        team: Option<&Team<'_>>,
+    ) -> String {
+        if let Some(run) = self.used(offer) {
+            return format!("it would fit, but the run {run} uses its component");
+        }
+        if let Some(bound) = self
+            .bound
+            .get(&need.role)
+            .filter(|bound| !bound.is_it(offer))
+        {
+            return bound.why(offer);
+        }
+        if let Some(lacking) = team.and_then(|team| team.lacks.get(offer.component.as_str())) {
+            let lacking: Vec<_> = lacking
+                .iter()
+                .map(|role| match self.step(*role) {
+                    Some(step) => format!("the step `{}`", step.name),
+                    None => role.name().to_owned(),
+                })
+                .collect();
+            return format!(
+                "it would fit, but its component has nothing for {}",
+                lacking.join(" and ")
+            );
+        }
+        let Some(chosen) = chosen else {
+            return "it would fit this step".to_owned();
+        };
+        let better = if is_exact(&[need], chosen) && !is_exact(&[need], offer) {
+            "is of just this capability"
+        } else if chosen.since_ms < offer.since_ms {
+            "has been there for longer"
+        } else {
+            "comes first by its name"
+        };
+        format!(
+            "it would fit, but {}.{} {better}",
+            chosen.component_name, chosen.name
+        )
+    }
+}
+
+/// The parameter that names a tool by its ApplicationUri.
+const TOOL: &str = "ToolAppUri";
