@@ -346,6 +346,128 @@ fn a_process_that_is_added_as_rdf_runs_with_one_gripper_and_outlasts_a_kill() {
     assert!(get("/plan/urn:hold").is_none());
 }
 
+/// Processes that take the pose of an object, and undo the grasp when the last move fails.
+const COMPENSATED: &str = r"processes:
+  - process: urn:fetch
+    wait: 30 s
+    steps:
+      - {step: locate, needs: {skill: {type: LocateObjectSkillType}}, parameters: {ObjectId: box}}
+      - step: move
+        needs: {skill: {type: PtpMoveSkillType}}
+        parameters: {TargetPosition: {result: Pose, of: locate}}
+      - step: grip
+        needs: {skill: {type: GraspSkillType}}
+        compensation: {step: let go, needs: {skill: {type: ReleaseSkillType}}}
+      - step: move away
+        needs: {skill: {type: PtpMoveSkillType}}
+        parameters: {TargetPosition: [AWAY, 0, 0.2, 0, 0, 0]}
+        by: {component_of: move}
+      - {step: put down, needs: {skill: {type: ReleaseSkillType}}}
+  - process: urn:hold
+    steps:
+      - {step: grip, needs: {skill: {type: GraspSkillType}}}
+      - {step: put down, needs: {skill: {type: ReleaseSkillType}}}
+";
+
+/// Starts the MES with these processes, whose last move goes so far.
+fn compensating(cell: &Cell, away: &str) -> Child {
+    let object = "<urn:box> <urn:ua-bridge:plant#objectId> \"box\" ; <urn:ua-bridge:plant#pose> \"0.4 0.2 0.1 0 0 0\" .";
+    fs::write(cell.folder().join("box.ttl"), object).unwrap();
+    let capabilities = Path::new(EXAMPLES).join("capabilities.ttl");
+    fs::copy(capabilities, cell.folder().join("capabilities.ttl")).unwrap();
+    let processes = COMPENSATED.replace("AWAY", away);
+    let changes = [
+        ("[capabilities.ttl]", "[capabilities.ttl, box.ttl]"),
+        ("processes:\n", &*processes),
+    ];
+    let mes = start(cell, "ua-mes", "mes.yaml", &changes, &[]);
+    eventually("all components are in the graph", SOON, || {
+        let known = rows("components");
+        let is_there = |name: &&str| known.iter().any(|row| row["name"] == *name);
+        let names = ["mes", "robot", "parallel-gripper"];
+        names.iter().all(is_there).then_some(())
+    });
+    mes
+}
+
+#[test]
+fn a_failed_job_undoes_its_steps_and_jobs_share_a_gripper() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let fast = [("{reach: 1.3}", "{reach: 1.3, time_scale: 20}")];
+    let _robot = start(&cell, "ua-component", "robot.yaml", &fast, &[]);
+    let fast = [("400 ms", "50 ms")];
+    let _gripper = start(&cell, "ua-component", "parallel-gripper.yaml", &fast, &[]);
+    let mes = compensating(&cell, "9");
+    let (done, told) = space(&["job", "start", "urn:fetch", "--wait"]);
+    assert!(!done, "{told}");
+    let ends = told.trim_end().ends_with("; compensated: `grip`");
+    assert!(
+        ends && told.contains("move away: robot.PtpMove Bad"),
+        "{told}"
+    );
+    let ran = eventually("the graph has the run", SOON, || {
+        let ran = rows("run-steps");
+        let is_over = rows("runs").first()?["outcome"] == "failed";
+        is_over.then_some(ran)
+    });
+    let part = |row: &Value| {
+        [
+            row["step"].clone(),
+            row["outcome"].clone(),
+            row["compensates"].clone(),
+        ]
+    };
+    let ran: Vec<Value> = ran
+        .iter()
+        .map(|row| part(row).into_iter().collect())
+        .collect();
+    let expected = serde_json::json!([
+        ["locate", "done", false],
+        ["move", "done", false],
+        ["grip", "done", false],
+        ["move away", "failed", false],
+        ["let go", "done", true],
+    ]);
+    assert_eq!(Value::from(ran), expected);
+    let (known, told) = space(&["job", "start", "urn:nothing"]);
+    assert!(!known && told.contains("is no process here"), "{told}");
+    drop(mes);
+
+    let _mes = compensating(&cell, "0.5");
+    for process in ["urn:fetch", "urn:hold", "urn:fetch"] {
+        let (started, told) = space(&["job", "start", process]);
+        assert!(started, "{told}");
+    }
+    let ended = eventually("all jobs have ended", SOON, || {
+        let listed = get("/jobs")?;
+        let all = list(&listed, "jobs").to_vec();
+        let have_ended = all.iter().all(|job| job["outcome"] != "running");
+        have_ended.then_some(all)
+    });
+    let outcomes: Vec<_> = ended.iter().map(|job| &job["outcome"]).collect();
+    assert_eq!(outcomes, ["done"; 3], "{ended:?}");
+    let (listed, told) = space(&["job", "list"]);
+    assert!(listed && told.matches("done").count() == 3, "{told}");
+    reaches_a_goal();
+}
+
+/// Adds the goal of the examples, and runs the sequence that reaches it.
+fn reaches_a_goal() {
+    let file = format!("{EXAMPLES}/goal.ttl");
+    let (added, told) = space(&["source", "add", &file]);
+    assert!(added, "{told}");
+    let goal = "urn:example:goal:sorted";
+    let (planned, told) = space(&["goal", goal, "--json"]);
+    assert!(
+        planned && told.contains(r#""fact":"urn:example:fact:holding","holds":true,"since":2"#),
+        "{told}"
+    );
+    let (done, told) = space(&["job", "start", goal, "--wait"]);
+    assert!(done && told.trim_end().ends_with(": done"), "{told}");
+    let (held, told) = space(&["ask", "what-can-hold", "100 mm/s", "--json"]);
+    assert!(held && told.contains("MaxVelocity"), "{told}");
+}
+
 /// Sends an update of SPARQL. Returns whether it was acknowledged.
 fn update(text: &str) -> bool {
     let send = || -> std::io::Result<String> {
