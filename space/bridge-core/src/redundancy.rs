@@ -12,11 +12,13 @@
 //! The module has no clock and no socket: times are inputs, and [`Redundancy::due`] returns the
 //! time of the next [`poll`](Redundancy::poll).
 
+mod clocks;
 mod heartbeat;
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
+pub(crate) use self::clocks::{SenderClocks, SentAt};
 pub use self::heartbeat::Heartbeat;
 use crate::settings::Now;
 
@@ -292,6 +294,8 @@ pub struct Redundancy {
     seen: Now,
     /// The time at which this bridge takes over, unless it receives an active bridge before.
     deadline: Instant,
+    /// The time since which the takeover is deferred.
+    deferred: Option<Instant>,
     /// The cause of the next takeover.
     cause: TakeoverCause,
     /// The instance of the active bridge that is followed.
@@ -320,6 +324,7 @@ impl Redundancy {
             leased: now.monotonic,
             seen: now,
             deadline: now.monotonic + rank.listening(),
+            deferred: None,
             cause: TakeoverCause::Start,
             followed: None,
             active_at: None,
@@ -409,6 +414,25 @@ impl Redundancy {
         match self.role {
             Role::Active => self.next,
             Role::Starting | Role::Standby => self.next.min(self.deadline),
+        }
+    }
+
+    /// Returns whether this bridge takes over at the next [`poll`](Self::poll).
+    #[must_use]
+    pub fn takes_over(&self, now: Instant) -> bool {
+        self.role != Role::Active && now >= self.deadline
+    }
+
+    /// Defers the takeover, because messages that have arrived are not handled yet: a heartbeat of
+    /// the active bridge may be among them. A takeover is deferred for at most 1 s, so that a flood
+    /// in the group does not prevent it.
+    pub fn defer(&mut self, now: Instant) {
+        if !self.takes_over(now) {
+            return;
+        }
+        let since = *self.deferred.get_or_insert(now);
+        if now.saturating_duration_since(since) < LONGEST_DEFERRAL {
+            self.deadline = now + DEFERRED;
         }
     }
 
@@ -592,6 +616,7 @@ impl Redundancy {
         self.active_at = Some(now.monotonic);
         self.is_released = false;
         self.deadline = now.monotonic + PATIENCE + self.turn(now.monotonic);
+        self.deferred = None;
         self.cause = TakeoverCause::Lost;
     }
 
@@ -646,6 +671,7 @@ impl Redundancy {
         self.role = Role::Active;
         self.epoch = known.unwrap_or(0).max(self.epoch).saturating_add(1);
         self.followed = None;
+        self.deferred = None;
         self.is_released = false;
         self.is_cut = false;
         self.unfit = 0;
@@ -717,6 +743,9 @@ const STARTED_LATER: Duration = Duration::from_millis(100);
 const QUIET: Duration = Duration::from_millis(30);
 /// The longest time between two steps of a bridge that runs.
 const TOLERATED: Duration = Duration::from_millis(30);
+/// The time by which a takeover is deferred while messages wait, and the longest such time.
+const DEFERRED: Duration = Duration::from_millis(2);
+const LONGEST_DEFERRAL: Duration = Duration::from_secs(1);
 /// The number of heartbeats for which the ROS side is out of reach before a bridge hands over.
 const UNFIT: u32 = 25;
 /// The longest stall after which a bridge without peers resumes at once. A bridge listens longer

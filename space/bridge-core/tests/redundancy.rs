@@ -538,6 +538,67 @@ fn a_command_that_may_have_been_delivered_is_not_delivered_by_the_new_bridge() {
     }
 }
 
+/// Returns the commands that the robots of space 2 receive.
+fn of_robots(world: &World) -> Vec<u32> {
+    let commands = world.published.iter();
+    let commands = commands.filter(|one| one.topic == topic(COMMAND) && one.by != READER);
+    commands.map(|one| one.value).collect()
+}
+
+#[test]
+fn a_command_that_the_network_holds_back_for_a_bridge_is_delivered_once() {
+    // The commander is known to the standby, or it sends for the first time.
+    for (is_known, held) in [(true, 160), (true, 3_000), (false, 160), (false, 800)] {
+        let mut world = World::new(CELL, 11);
+        // Its clock does not matter to a bridge that knows it.
+        let skew = if is_known { 7_200_000_000_000 } else { 0 };
+        world.programs[COMMANDER].skew = skew;
+        world.programs[COMMANDER].is_dead = !is_known;
+        world.run(700);
+        if is_known {
+            world.say(COMMAND, 1);
+            world.run(200);
+        }
+        let first = world.command(2);
+        let (from, passed) = (world.programs[COMMANDER].address, world.passed);
+        world.programs[A]
+            .socket
+            .push((passed + 1, from, first.clone()));
+        world.run(2);
+        world.programs[A].is_dead = true;
+        world.programs[COMMANDER].is_dead = true;
+        world.run(held);
+        assert_eq!(world.role(B), Role::Active);
+        let passed = world.passed;
+        world.programs[B].socket.push((passed + 1, from, first));
+        world.run(50);
+        let expected: &[u32] = if is_known { &[1, 2] } else { &[2] };
+        assert_eq!(of_robots(&world), expected, "{held} ms");
+        assert_eq!(world.dropped(B, Reason::Takeover), 1, "{held} ms");
+    }
+}
+
+#[test]
+fn a_commander_that_starts_after_a_takeover_is_heard_after_a_second() {
+    for (pause, arrives) in [(300, false), (1_500, true)] {
+        let mut world = World::new(CELL, 12);
+        world.programs[COMMANDER].is_dead = true;
+        world.run(700);
+        world.programs[A].is_dead = true;
+        world.run(pause);
+        assert_eq!(world.role(B), Role::Active);
+        world.programs[COMMANDER].is_dead = false;
+        world.say(COMMAND, 5);
+        world.run(100);
+        assert_eq!(of_robots(&world) == [5], arrives, "{pause} ms");
+        // A later command of the same commander is dated by its messages.
+        world.run(1_500);
+        world.say(COMMAND, 6);
+        world.run(100);
+        assert_eq!(of_robots(&world).last(), Some(&6));
+    }
+}
+
 #[test]
 fn a_command_that_is_received_in_the_pass_of_the_takeover_is_not_delivered() {
     for delay in 60.. {
@@ -710,5 +771,43 @@ fn in_a_secured_group_a_bridge_without_keys_never_becomes_active() {
         world.dropped(READER, Reason::Replayed),
         0,
         "no nonce is used twice"
+    );
+}
+
+#[test]
+fn in_a_secured_group_a_heartbeat_in_clear_changes_no_role() {
+    let mut world = World::new(&format!("{CELL}{SECURED}"), 8);
+    let now = world.now(B);
+    for program in &mut world.programs {
+        program.router.set_keys("cell", &keys(1), now).unwrap();
+    }
+    world.run(700);
+    assert_eq!(world.role(A), Role::Active);
+    // The heartbeat of an active bridge in a group without security.
+    let mut other = World::new(CELL, 8);
+    other.programs[A].is_dead = true;
+    other.run(700);
+    other.passed += 25;
+    let now = other.now(B);
+    let mut clear = Vec::new();
+    other.programs[B].router.handle_timeout(now);
+    while let Some(output) = other.programs[B].router.poll_output(now) {
+        if let Output::Heartbeat { bytes } = output {
+            clear = bytes;
+        }
+    }
+    assert!(!clear.is_empty());
+    let (from, passed) = (other.programs[B].address, world.passed);
+    for at in [A, READER] {
+        let socket = &mut world.programs[at].socket;
+        socket.push((passed + 1, from, clear.clone()));
+    }
+    world.run(2);
+    for at in [A, READER] {
+        assert_eq!(world.dropped(at, Reason::Unsecured), 1);
+    }
+    assert_eq!(
+        (world.role(A), world.role(B)),
+        (Role::Active, Role::Standby)
     );
 }

@@ -418,3 +418,47 @@ fn a_heartbeat_is_read_as_it_was_written_and_nothing_else_is_one() {
         }
     }
 }
+
+#[test]
+fn a_takeover_waits_for_messages_that_have_arrived_but_not_for_ever() {
+    let start = start();
+    let at = |ms: u64| Now {
+        monotonic: start.monotonic + STEP * u32::try_from(ms).unwrap(),
+        utc: Timestamp::from_unix_nanos(start.utc.unix_nanos() + i128::from(ms) * 1_000_000),
+    };
+    let mut state = Redundancy::new(Rank::new(2).unwrap(), 2, start);
+    let active = Heartbeat {
+        rank: Rank::new(1).unwrap(),
+        role: Role::Active,
+        epoch: 1,
+        instance: 1,
+        is_fit: true,
+        is_released: false,
+    };
+    let step = |state: &mut Redundancy, ms: u64, waits: bool| {
+        let _none = state.check(at(ms));
+        if waits {
+            state.defer(at(ms).monotonic);
+        }
+        let _heartbeat = state.poll(at(ms));
+        state.role()
+    };
+    state.hear(active, address(1), at(1));
+    for ms in 2..=100 {
+        assert_eq!(step(&mut state, ms, false), Role::Standby);
+    }
+    // The heartbeat is behind other messages.
+    for ms in 101..=400 {
+        assert_eq!(step(&mut state, ms, true), Role::Standby, "{ms} ms");
+    }
+    state.hear(active, address(1), at(401));
+    for ms in 402..=500 {
+        assert_eq!(step(&mut state, ms, false), Role::Standby, "{ms} ms");
+    }
+    // A flood does not end.
+    let taken = (501..2_000).find(|ms| step(&mut state, *ms, true) == Role::Active);
+    assert!(
+        taken.is_some_and(|ms| (1_500..=1_510).contains(&ms)),
+        "{taken:?}"
+    );
+}

@@ -10,7 +10,6 @@ use uadp::{
 };
 
 use super::content::Quality;
-use super::redundant::precedes;
 use super::{About, Router, Values};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
@@ -45,6 +44,13 @@ impl Router {
         from: SocketAddr,
         now: Now,
     ) {
+        self.sort_network_message(message, from, now);
+        if self.values.redundant.is_some() {
+            self.note_clock(sent(&message.header()), from, now);
+        }
+    }
+
+    fn sort_network_message(&mut self, message: &NetworkMessage<'_>, from: SocketAddr, now: Now) {
         let header = message.header();
         let late = self
             .values
@@ -238,7 +244,7 @@ impl Values {
         let mut place = place(topic, message, (from, sent));
         let local = self.settings.local;
         let relay = self.relay;
-        let took_over = self.took_over();
+        let since_takeover = self.since_takeover(&place, now);
         let Some(at) = self.entry(topic, from, now) else {
             return;
         };
@@ -274,7 +280,9 @@ impl Values {
         };
         let is_confirmed = confirming.is_some();
         let lasts = (*lasting, confirming.as_deref().map(Confirming::within));
-        if matches!(admitted, Some(Ok(_))) && precedes(took_over, &place, lasts, now) {
+        if matches!(admitted, Some(Ok(_)))
+            && since_takeover.is_some_and(|since| since.is_preceded_by(&place, lasts))
+        {
             admitted = Some(Err(Reason::Takeover));
         }
         if let Some(Ok(admitted)) = &admitted {

@@ -15,7 +15,9 @@ use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
-use crate::redundancy::{Heartbeat, Rank, Redundancy, RoleChange, SwitchRefusal};
+use crate::redundancy::{
+    Heartbeat, Rank, Redundancy, RoleChange, SenderClocks, SentAt, SwitchRefusal, TakeoverCause,
+};
 use crate::settings::Now;
 use crate::topic::{Item, Role, Topic};
 use crate::topics::Handle;
@@ -33,12 +35,22 @@ pub(super) struct Redundant {
     unsure: BTreeMap<TopicId, u64>,
     /// The last message of the active bridge for each own topic with a state.
     followed: HashMap<TopicId, Followed>,
-    /// The time of the last takeover.
-    took_over: Option<Instant>,
+    /// The last takeover, as long as this program is active.
+    took_over: Option<Succession>,
+    /// The clocks of the senders in the group.
+    clocks: SenderClocks,
     /// Samples of the own space that were not sent while this bridge was muted.
     muted_sent: u64,
     /// Samples of other spaces that were not published while this bridge was muted.
     muted_delivered: u64,
+}
+
+/// A takeover by this program.
+#[derive(Debug, Clone, Copy)]
+struct Succession {
+    at: Now,
+    /// Whether another bridge may have been active before.
+    is_of_another: bool,
 }
 
 /// A state of another space.
@@ -77,6 +89,7 @@ impl Router {
             unsure: BTreeMap::new(),
             followed: HashMap::new(),
             took_over: None,
+            clocks: SenderClocks::new(now),
             muted_sent: 0,
             muted_delivered: 0,
         }));
@@ -99,6 +112,21 @@ impl Router {
             sent: redundant.muted_sent,
             delivered: redundant.muted_delivered,
         })
+    }
+
+    /// Returns whether this program takes over at the next
+    /// [`handle_timeout`](Self::handle_timeout).
+    #[must_use]
+    pub fn takes_over(&self, now: Instant) -> bool {
+        self.redundancy().is_some_and(|state| state.takes_over(now))
+    }
+
+    /// Defers the takeover, because datagrams that have arrived are not handled yet. A takeover is
+    /// deferred for at most 1 s.
+    pub fn defer_takeover(&mut self, now: Instant) {
+        if let Some(redundant) = &mut self.values.redundant {
+            redundant.state.defer(now);
+        }
     }
 
     /// Sets whether the local side is within reach.
@@ -257,6 +285,13 @@ impl Router {
         let Some((space, heartbeat)) = Heartbeat::decode(message) else {
             return false;
         };
+        if self.security.is_on() && !self.security.is_authentic() {
+            let cause = (Reason::Unsecured, "heartbeat");
+            self.values.count(About::sender(from), cause, 1, || {
+                "its heartbeat is in clear, and there are secured groups".to_owned()
+            });
+            return true;
+        }
         if space != self.values.settings.own {
             self.meet_redundant(space, heartbeat, from, now);
             return true;
@@ -501,16 +536,41 @@ impl Router {
 }
 
 impl Values {
-    /// Returns the time of the last takeover, as long as this program is active.
-    pub(super) fn took_over(&self) -> Option<Instant> {
-        self.redundant.as_ref()?.took_over
+    /// Returns the relation of a received message to the last takeover, as long as this program is
+    /// active and the network may still hold messages that precede the takeover.
+    pub(super) fn since_takeover(&self, place: &Place, now: Now) -> Option<SinceTakeover> {
+        let redundant = self.redundant.as_ref()?;
+        let Succession { at, is_of_another } = redundant.took_over?;
+        if now.monotonic.saturating_duration_since(at.monotonic) >= HELD_AT_MOST {
+            return None;
+        }
+        let sent_at = place
+            .sent
+            .and_then(|sent| redundant.clocks.sent_at(place.from, sent, at.monotonic));
+        Some(SinceTakeover {
+            at,
+            is_of_another,
+            sent_at,
+            now,
+        })
     }
 }
 
 impl Router {
+    /// Records the clock of the sender of a message that was processed.
+    pub(super) fn note_clock(&mut self, sent: Option<Timestamp>, from: SocketAddr, now: Now) {
+        // Unsecured messages of a secured group can be forged.
+        let is_trusted = !self.security.is_on() || self.security.is_authentic();
+        if let Some(redundant) = self.values.redundant.as_mut().filter(|_| is_trusted)
+            && let Some(sent) = sent.filter(|sent| sent.time.0 != 0)
+        {
+            redundant.clocks.note(from, sent, now.monotonic);
+        }
+    }
+
     fn change_role(&mut self, change: RoleChange, now: Now) {
         match change {
-            RoleChange::TookOver { gap, .. } => self.unmute(gap, now),
+            RoleChange::TookOver { gap, cause, .. } => self.unmute((gap, cause), now),
             RoleChange::Muted { .. } => self.mute_all(now),
             RoleChange::CutOff
             | RoleChange::Follows { .. }
@@ -571,7 +631,7 @@ impl Values {
 
 impl Router {
     /// Continues where the former active bridge ended. `gap` is the time since its last heartbeat.
-    fn unmute(&mut self, gap: Option<Duration>, now: Now) {
+    fn unmute(&mut self, (gap, cause): (Option<Duration>, TakeoverCause), now: Now) {
         // The former active bridge may have sent or published what waits since the last output.
         let topics = self.values.topics.handles();
         for at in &topics {
@@ -580,7 +640,10 @@ impl Router {
         let Some(redundant) = &mut self.values.redundant else {
             return;
         };
-        redundant.took_over = Some(now.monotonic);
+        redundant.took_over = Some(Succession {
+            at: now,
+            is_of_another: cause != TakeoverCause::Start,
+        });
         redundant.followed.clear();
         let held = std::mem::take(&mut redundant.held);
         let losses = std::mem::take(&mut redundant.losses);
@@ -657,29 +720,63 @@ impl Router {
     }
 }
 
-/// Returns whether an event was first sent before the takeover: the former active bridge may have
-/// delivered it. `within` is the time for which its writer repeats it until it is confirmed.
-pub(super) fn precedes(
-    took_over: Option<Instant>,
-    place: &Place,
-    (lasting, within): (Lasting, Option<Duration>),
+/// The relation of a received message to the last takeover.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SinceTakeover {
+    at: Now,
+    is_of_another: bool,
+    /// The time at which the message was sent, if the clock of its sender was known before the
+    /// takeover.
+    sent_at: Option<SentAt>,
     now: Now,
-) -> bool {
-    let (Some(took_over), Some(stamp), Some(sent)) = (took_over, place.stamp, place.sent) else {
-        return false;
-    };
-    let Ok(age) = u64::try_from(sent.unix_nanos() - stamp.unix_nanos()) else {
-        return false;
-    };
-    let age = Duration::from_nanos(age);
-    let is_event = match lasting {
-        Lasting::State => false,
-        Lasting::Event => true,
-        // An older value is a stored state.
-        Lasting::AsSource => age < within.unwrap_or_default().max(OLDEST_EVENT),
-    };
-    let first = now.monotonic.checked_sub(age);
-    is_event && first.is_none_or(|first| first + SLACK < took_over)
+}
+
+impl SinceTakeover {
+    /// Returns whether an event was first sent before the takeover: the former active bridge may
+    /// have delivered it. `within` is the time for which a command is repeated until it is
+    /// confirmed; `None` for other events.
+    ///
+    /// A command that cannot be dated counts as earlier for a second after another bridge was
+    /// active.
+    pub(super) fn is_preceded_by(
+        self,
+        place: &Place,
+        (lasting, within): (Lasting, Option<Duration>),
+    ) -> bool {
+        let age = place.stamp.zip(place.sent).map(|(stamp, sent)| {
+            let age = sent.unix_nanos() - stamp.unix_nanos();
+            Duration::from_nanos(u64::try_from(age.max(0)).unwrap_or(u64::MAX))
+        });
+        // The repetitions of an event end after this time. A longer age is that of a stored state,
+        // or the stamp is from another clock.
+        let longest = within.unwrap_or_default().max(OLDEST_EVENT);
+        let is_event = match lasting {
+            Lasting::State => false,
+            Lasting::Event => true,
+            Lasting::AsSource => age.is_none_or(|age| age < longest),
+        };
+        if !is_event {
+            return false;
+        }
+        let (Some(age), Some(sent)) = (age, place.sent) else {
+            let is_command = within.is_some() && self.is_of_another;
+            let passed = self.now.monotonic - self.at.monotonic;
+            return is_command && passed < CLOCKS_DIFFER;
+        };
+        let age = age.min(longest);
+        let first = match (self.sent_at, within.filter(|_| self.is_of_another)) {
+            (Some(SentAt::BeforeStart), _) => None,
+            (Some(SentAt::Since(sent)), _) => sent.checked_sub(age),
+            // Only the clocks of the two hosts can be compared.
+            (None, Some(_)) => {
+                let age = i128::try_from(age.as_nanos()).unwrap_or(i128::MAX);
+                let since = sent.unix_nanos() - age - self.at.utc.unix_nanos();
+                return since < i128::try_from(CLOCKS_DIFFER.as_nanos()).unwrap_or(i128::MAX);
+            }
+            (None, None) => self.now.monotonic.checked_sub(age),
+        };
+        first.is_none_or(|first| first + SLACK < self.at.monotonic)
+    }
 }
 
 /// The number of sequence numbers that are skipped at a takeover: more than the former active
@@ -692,3 +789,7 @@ const OLDEST_EVENT: Duration = Duration::from_millis(500);
 /// The time by which the clocks of the writer and of the network may differ. The former active
 /// bridge has sent nothing for longer at a takeover.
 const SLACK: Duration = Duration::from_millis(5);
+/// The time by which the clocks of two hosts may differ.
+const CLOCKS_DIFFER: Duration = Duration::from_secs(1);
+/// The longest time for which a network holds a datagram back.
+const HELD_AT_MOST: Duration = Duration::from_secs(10);

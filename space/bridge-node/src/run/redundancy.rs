@@ -14,19 +14,20 @@ use crate::port::Port;
 use crate::redundancy::uncovered;
 
 impl<P: Port> Shell<P> {
-    /// Handles the datagrams that wait in the socket, so that no takeover is decided before the
-    /// heartbeats that have arrived are read.
+    /// Handles the datagrams that wait in the socket before a takeover: the heartbeats of the active
+    /// bridge may be among them. If they are too many, the takeover is deferred.
     pub(super) fn read_waiting(&mut self, buffer: &mut Vec<u8>) {
-        if self.router.redundancy().is_none() {
-            return;
-        }
         for _ in 0..READ_AT_ONCE {
+            if !self.router.takes_over(now().monotonic) {
+                return;
+            }
             let Some(received) = self.carrier.try_recv(buffer) else {
                 return;
             };
             self.heard(received, buffer);
             self.drain();
         }
+        self.router.defer_takeover(now().monotonic);
     }
 
     pub(super) fn send_heartbeat(&mut self, bytes: Vec<u8>) {
@@ -142,5 +143,5 @@ fn tell_same_rank(rank: Option<u8>, from: SocketAddr) {
     error!(rank, other = %from, "another bridge has the same rank; give one of them another --rank");
 }
 
-/// The maximum number of datagrams that are handled before a heartbeat.
+/// The maximum number of datagrams that are handled in a row before a takeover.
 const READ_AT_ONCE: usize = 256;
