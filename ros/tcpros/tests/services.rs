@@ -4,10 +4,12 @@
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
 use std::collections::VecDeque;
-use std::future::Future;
+use std::future::{Future, poll_fn};
 use std::net::SocketAddr;
+use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::task::Poll;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -393,8 +395,14 @@ async fn a_server_that_does_not_grant_persistence_is_connected_to_for_every_call
     let cell = node("cell", &core);
     let listener = server_by_hand(&core, "/grip").await;
     let client = persistent(&cell, "/grip");
-    let serve = async {
-        for _ in 0..20 {
+    let mut answered = None;
+    for n in 0..20u8 {
+        let mut call = pin!(client.call(Bytes::from(vec![n])));
+        // The next call begins before the server closes the connection of the previous call.
+        let begun = poll_fn(|cx| Poll::Ready(call.as_mut().poll(cx))).await;
+        assert!(begun.is_pending(), "{begun:?}");
+        drop(answered.take());
+        let serve = async {
             let (mut stream, header) = accept(&listener).await;
             assert_eq!(header.get("persistent"), Some("1"));
             let request = take_request(&mut stream).await;
@@ -402,17 +410,13 @@ async fn a_server_that_does_not_grant_persistence_is_connected_to_for_every_call
                 .write_all(&[1, 1, 0, 0, 0, request[0]])
                 .await
                 .unwrap();
-            // Late enough for the next call to be first.
-            tokio::time::sleep(Duration::from_millis(3)).await;
-        }
-    };
-    let call = async {
-        for n in 0..20u8 {
-            let answer = client.call(Bytes::from(vec![n])).await;
-            assert_eq!(answer.unwrap(), vec![n]);
-        }
-    };
-    within("the calls", async { tokio::join!(serve, call) }).await;
+            stream
+        };
+        let both = async { tokio::join!(serve, call) };
+        let (stream, answer) = within("the call", both).await;
+        assert_eq!(answer.unwrap(), vec![n]);
+        answered = Some(stream);
+    }
 }
 
 /// The kernel holds five connections that a rospy server has not accepted yet, and drops the

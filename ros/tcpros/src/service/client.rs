@@ -398,18 +398,28 @@ impl Connection {
     /// response, and its header does not announce this. A second call that follows quickly
     /// therefore waits for a moment.
     async fn is_open(&mut self) -> bool {
-        let mut byte = [MaybeUninit::uninit()];
-        // Read from the system itself: the runtime may not have polled the socket after the last
-        // response.
-        match SockRef::from(&self.stream).peek(&mut byte) {
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
-            Ok(_) | Err(_) => return false,
+        if !self.is_quiet() {
+            return false;
         }
         let rest = match self.answers {
             1 => CLOSING_TIME.saturating_sub(self.answered.elapsed()),
             _ => Duration::ZERO,
         };
-        rest.is_zero() || timeout(rest, self.stream.peek(&mut [0])).await.is_err()
+        if rest.is_zero() {
+            return true;
+        }
+        let closing = timeout(rest, self.stream.peek(&mut [0])).await;
+        // The time of a process that did not run for a while ends before its runtime polls the
+        // socket.
+        closing.is_err() && self.is_quiet()
+    }
+
+    /// Returns whether nothing was received: neither data nor the end of the connection. Reads from
+    /// the system itself: the runtime may not have polled the socket after the last response.
+    fn is_quiet(&self) -> bool {
+        let mut byte = [MaybeUninit::uninit()];
+        let peeked = SockRef::from(&self.stream).peek(&mut byte);
+        peeked.is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
     }
 
     /// Reads the ok byte and the body of a response.
