@@ -53,6 +53,8 @@ impl OwnFilter {
             Ok(()) => self.set = Some(sources),
             Err(error) => {
                 self.refused = true;
+                // A previous filter could drop datagrams of another program that gets an old port.
+                drop(SockRef::from(receiver).detach_filter());
                 debug!(
                     %error,
                     "the kernel does not filter own datagrams: each is received and dropped here"

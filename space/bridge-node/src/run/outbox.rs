@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use bridge_core::{Reason, Redundancy};
 use mappings::TopicId;
 use transport::{Outgoing, SendError};
 
@@ -53,6 +54,18 @@ impl<P: Port> Shell<P> {
     /// Sends the posted datagrams.
     pub(super) fn flush(&mut self) {
         let mut parcels = std::mem::take(&mut self.outbox.0);
+        // The lease may have ended since the datagrams were posted: another bridge is active.
+        let redundancy = self.router.redundancy();
+        if redundancy.is_some_and(Redundancy::mutes_group) {
+            for parcel in parcels.drain(..) {
+                for topic in std::iter::once(parcel.topic).chain(parcel.with) {
+                    self.router.not_sent(topic, Reason::Takeover, MUTED);
+                }
+                self.router.recycle(parcel.bytes);
+            }
+            self.outbox.0 = parcels;
+            return;
+        }
         let errors = self.send_all(&parcels);
         for (index, parcel) in parcels.drain(..).enumerate() {
             if let Some(error) = errors.get(&index) {
@@ -82,6 +95,8 @@ impl<P: Port> Shell<P> {
     }
 }
 
+/// The reason for which a posted datagram is dropped, as text for the user.
+const MUTED: &str = "this bridge is not active any more";
 /// The maximum number of datagrams that are sent together.
 const SENT_AT_ONCE: usize = 32;
 /// The size in bytes above which a datagram is sent alone. A datagram of this size fits the MTU of
