@@ -484,6 +484,37 @@ fn a_state_is_repeated_by_the_new_bridge_and_delivered_once() {
 }
 
 #[test]
+fn a_bridge_that_is_active_again_has_the_states_for_late_joiners() {
+    let mut world = World::new(CELL, 13);
+    world.run(700);
+    world.say(TARGET, 70);
+    world.run(2_500);
+    let of_a = |world: &World| -> Vec<(u32, Kept)> {
+        let published = world.published.iter();
+        let published = published.filter(|one| one.by == A && one.topic == topic(TARGET));
+        published.map(|one| (one.value, one.kept)).collect()
+    };
+    assert_eq!(of_a(&world), [(70, Kept::Alone)]);
+    // The other bridge takes over, and ends later.
+    world.programs[A].stopped = world.passed + 500;
+    world.run(3_000);
+    assert_eq!(
+        (world.role(A), world.role(B)),
+        (Role::Standby, Role::Active)
+    );
+    world.programs[B].is_dead = true;
+    world.run(3_000);
+    assert_eq!(world.role(A), Role::Active);
+    assert_eq!(of_a(&world), [(70, Kept::Alone), (70, Kept::Again)]);
+    // No other bridge takes over.
+    world.programs[A].stopped = world.passed + 500;
+    world.run(3_000);
+    assert_eq!(world.role(A), Role::Active);
+    assert_eq!(of_a(&world).len(), 3);
+    assert_eq!(of_a(&world).last(), Some(&(70, Kept::Again)));
+}
+
+#[test]
 fn a_state_that_changes_while_no_bridge_is_active_arrives() {
     let mut world = World::new(CELL, 3);
     world.run(700);

@@ -589,6 +589,7 @@ impl Router {
         }
         for at in self.values.topics.handles() {
             self.values.mute_topic(at.topic(), now);
+            self.values.withdraw_states(at);
         }
         self.values.paced.clear();
         // A heartbeat that was made before is outdated.
@@ -612,6 +613,20 @@ impl Values {
             self.empty_topic(topic, now);
         }
         is_muted
+    }
+
+    /// Lets the next repetition of a state of another space reach the late joiners of the local
+    /// side, which drops its stored values when this bridge is muted. A command is not delivered
+    /// again.
+    fn withdraw_states(&mut self, at: Handle) {
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            confirming: None,
+            ..
+        }) = self.topics.at_mut(at)
+        {
+            reader.withdraw();
+        }
     }
 
     fn empty_topic(&mut self, topic: TopicId, now: Now) {
