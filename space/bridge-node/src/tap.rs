@@ -58,12 +58,12 @@ impl TapRequest {
                 Some(("from", text)) => {
                     from = text
                         .parse()
-                        .map_err(|_| format!("from={text}: a number is wanted"))?;
+                        .map_err(|_| format!("from={text}: expected a number"))?;
                 }
                 _ => {}
             }
         }
-        let topic = topic.ok_or("a topic is wanted, as /tap?topic=ua_1_2_10")?;
+        let topic = topic.ok_or("expected a topic, such as /tap?topic=ua_1_2_10")?;
         Ok(Self { topic, from })
     }
 }
