@@ -46,6 +46,7 @@ pub async fn run_part<T>(
             has_begun = true;
             run.as_mut().await
         } => {
+            let ended = known(skill, ended);
             if let Err(fault @ SkillFault::NotHalted(_)) = &ended {
                 teller.unknown(&fault.to_string()).await;
             }
@@ -75,14 +76,27 @@ async fn halt(
             teller.pending(&why).await;
         }
         if let Ok(ended) = timeout(HALT_AGAIN, run.as_mut()).await {
-            return confirmed(ended);
+            return confirmed(known(skill, ended));
         }
     }
     teller.pending(&goes_on(&skill.name()).to_string()).await;
     tokio::select! {
-        ended = run => confirmed(ended),
+        ended = run => confirmed(known(skill, ended)),
         why = skill.lost() => Err(SkillFault::Lost(why)),
     }
+}
+
+/// Turns an outcome that is unknown into an error: the machine may move.
+fn known(skill: &dyn Runs, ended: Result<Outcome, SkillFault>) -> Result<Outcome, SkillFault> {
+    ended.and_then(|outcome| match outcome.unknown {
+        false => Ok(outcome),
+        true => Err(SkillFault::NotHalted(format!(
+            "the end of run {} of {} is unknown: {}",
+            outcome.run,
+            skill.name(),
+            outcome.message
+        ))),
+    })
 }
 
 /// An error if the run may go on.
@@ -129,6 +143,8 @@ mod tests {
         Halts,
         /// The run refuses a Halt.
         Refuses,
+        /// The run takes a Halt, and its outcome is unknown.
+        Lost,
     }
 
     struct Scripted {
@@ -169,7 +185,7 @@ mod tests {
             Ok(Outcome {
                 run,
                 succeeded: self.way == Way::Done,
-                unknown: false,
+                unknown: self.way == Way::Lost,
                 message: String::new(),
                 results: Vec::new(),
                 trace: Vec::new(),
@@ -179,7 +195,7 @@ mod tests {
         async fn halt(&self) -> Result<(), SkillFault> {
             self.halts.fetch_add(1, Ordering::Relaxed);
             match self.way {
-                Way::Done | Way::Halts => Ok(()),
+                Way::Done | Way::Halts | Way::Lost => Ok(()),
                 Way::Refuses => Err(goes_on("gripper.Grasp")),
             }
         }
@@ -247,6 +263,23 @@ mod tests {
         assert!(message.contains("whether it moves is unknown"), "{message}");
         skill.call(BY, Method::Reset).await.unwrap();
         assert!(!skill.shown().needs_reset);
+    }
+
+    #[tokio::test]
+    async fn a_composite_with_a_part_whose_outcome_is_unknown_needs_a_reset() {
+        for is_halted in [true, false] {
+            let (skill, grasp) = at_grasp(Way::Lost).await;
+            if is_halted {
+                skill.call(BY, Method::Halt).await.unwrap();
+            }
+            grasp.may_end.send_replace(true);
+            let shown = until(&skill, |shown| shown.state == State::Halted).await;
+            assert!(shown.needs_reset);
+            let outcome = shown.outcome.clone().unwrap();
+            assert!(outcome.unknown);
+            let why = "the end of run 1 of gripper.Grasp is unknown";
+            assert!(outcome.message.contains(why), "{outcome:?}");
+        }
     }
 
     #[tokio::test]

@@ -66,7 +66,8 @@ pub enum SkillFault {
     /// The run did not end in time and was halted.
     #[error("it did not end within {0:?} and was halted")]
     TimedOut(Duration),
-    /// The skill was halted, and its end was not confirmed: the movement of its machine is unknown.
+    /// The end of the run is unknown, for example after a Halt that was not confirmed: its machine
+    /// may move.
     #[error("{0}")]
     NotHalted(String),
     /// The skill does not have the expected form.
