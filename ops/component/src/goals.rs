@@ -439,6 +439,9 @@ impl Sent {
         if let Some(passing) = self.passing.take() {
             self.tell(Some(passing));
         }
+        if outcome.unknown {
+            return self.lost(outcome.message.clone());
+        }
         let status = match (outcome.succeeded, self.is_cancelled(outcome.run)) {
             (true, _) => SUCCEEDED,
             (false, true) => CANCELED,
