@@ -13,6 +13,7 @@ mod exec;
 mod executor;
 mod fields;
 mod goals;
+mod idle;
 mod mirrors;
 mod partners;
 mod port;

@@ -21,8 +21,7 @@ use plant_opcua::supervision::Supervision;
 use program::{Method, State};
 use skills::server::{ComponentServer, PowerOff, ServeFault, ServeSettings};
 use skills::{
-    Authority, Component, DriverSetup, LiveValue, Owner, PeerAccess, Security, Skill, Takes,
-    ValueSource,
+    Component, DriverSetup, LiveValue, Owner, PeerAccess, Security, Skill, Takes, ValueSource,
 };
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, JoinSet};
@@ -33,6 +32,7 @@ use crate::asking::Asking;
 use crate::executor::Executor;
 use crate::fields;
 use crate::goals::{self, Doer, Reporter};
+use crate::idle::{Usage, restart_when_idle};
 use crate::partners;
 use crate::reload::{ComponentFile, Version};
 use crate::space::{GOAL, MOST_IN_SPACE, Outbox, Place, Speaker};
@@ -125,8 +125,7 @@ impl ComponentPort {
             configuration: options.configuration.clone(),
         };
         let mut reporters = Vec::new();
-        let mut asking = Asking::new();
-        let mut topics = Topics::default();
+        let (mut asking, mut topics) = (Asking::new(), Topics::default());
         let component = &with_drivers(component, &mut asking, &mut topics);
         let server = ComponentServer::build(component, &settings, |number, facts| {
             let reporter = Reporter::new();
@@ -153,7 +152,7 @@ impl ComponentPort {
         server.start();
         let told = told_of(component, server.url(), options);
         let application = application(&told, &component.security);
-        enrol(&mut looks, (component, &told), options, Usage::of(&server));
+        enrol(&mut looks, (component, &told), options, &server);
         let announced = announce(told, component, options, settings.supervision);
         if server.skills().len() > MOST_IN_SPACE {
             warn!(
@@ -184,10 +183,7 @@ impl ComponentPort {
             application,
             closing: Arc::default(),
             pki: options.pki.clone(),
-            versions: options.file.clone().map(|file| {
-                let started = Arc::clone(file.started());
-                (file, started)
-            }),
+            versions: options.file.clone().map(versions),
             restarting: None,
         })
     }
@@ -217,12 +213,13 @@ impl ComponentPort {
             ..latest.component.clone()
         };
         let component = with_drivers(&component, &mut self.asking, &mut self.topics);
-        if let Err(fault) = self.server.replace_drivers(&component, &names) {
-            // A change that needs a restart comes with it.
-            warn!("the drivers stay as they are until the restart: {fault}");
-        }
         let changes = Component::changes(&file.started().text, &latest.text);
-        *adopted = latest;
+        match self.server.replace_drivers(&component, &names) {
+            Ok(()) => *adopted = latest,
+            // A change that needs a restart comes with it. Drivers that were not replaced are
+            // compared with the next version again.
+            Err(fault) => warn!("the drivers stay as they are until the restart: {fault}"),
+        }
         let of = |takes: Takes| {
             let changes = changes.iter().filter(move |change| change.takes == takes);
             changes.map(|change| change.path.clone())
@@ -235,7 +232,8 @@ impl ComponentPort {
         }
         if !by_itself.is_empty() {
             let why = format!("with {}", by_itself.join(", "));
-            let waits = tokio::spawn(restart_when_idle(Usage::of(&self.server), why));
+            let usage = Usage::of(&self.server, Some(Arc::clone(file)));
+            let waits = tokio::spawn(restart_when_idle(usage, why));
             self.restarting = Some(AbortOnDrop(waits.abort_handle()));
         }
         Vec::new()
@@ -471,6 +469,12 @@ fn replaced_drivers(before: &Version, after: &Version) -> Vec<String> {
     names
 }
 
+/// Returns the file with the version that drivers are made of at the start.
+fn versions(file: Arc<ComponentFile>) -> (Arc<ComponentFile>, Arc<Version>) {
+    let started = Arc::clone(file.started());
+    (file, started)
+}
+
 /// A task that ends when this value is dropped.
 struct AbortOnDrop(AbortHandle);
 
@@ -582,7 +586,7 @@ fn enrol(
     tasks: &mut JoinSet<()>,
     (component, announced): (&Component, &discovery::Server),
     options: &Options,
-    usage: Usage,
+    server: &ComponentServer,
 ) {
     let (Some(root), Some(gds)) = (&options.pki, &options.gds) else {
         return;
@@ -592,6 +596,7 @@ fn enrol(
     let urls = endpoint.zip(port.ok()).map(|(url, port)| url.urls(port));
     let applicant = announced.applicant(urls.unwrap_or_default());
     let enrolment = Enrolment::new(root, applicant, gds.clone());
+    let usage = Usage::of(server, options.file.clone());
     tasks.spawn(async move {
         enrolment
             .keep(|| {
@@ -600,44 +605,6 @@ fn enrol(
             })
             .await;
     });
-}
-
-/// The use of the component by clients.
-#[derive(Clone)]
-struct Usage {
-    skills: Vec<Skill>,
-    authority: Authority,
-}
-
-impl Usage {
-    fn of(server: &ComponentServer) -> Self {
-        Self {
-            skills: server.skills().to_vec(),
-            authority: server.authority().clone(),
-        }
-    }
-
-    /// Reserves the component for its restart, if it is idle. The restart would forget that the
-    /// outcome of a run is unknown, so such a skill is reset first.
-    fn reserve(&self) -> bool {
-        let mut skills = self.skills.iter();
-        !skills.any(|skill| skill.shown().needs_reset) && self.authority.reserve()
-    }
-}
-
-/// Restarts the program when no skill runs or needs a Reset and no client holds the lease, because
-/// a restart must not stop a machine or part a composite. No run starts after that.
-async fn restart_when_idle(usage: Usage, why: String) {
-    if !usage.reserve() {
-        info!(
-            "the program restarts {why} when no skill runs or needs a Reset and no client holds the lease"
-        );
-        while !usage.reserve() {
-            tokio::time::sleep(IDLE_LOOK).await;
-        }
-    }
-    info!("the program restarts {why}");
-    bridge_node::restart();
 }
 
 /// Returns the description of the component for the group.
@@ -682,8 +649,6 @@ fn announce(
     }
 }
 
-/// Interval between two checks of the skills before a restart.
-const IDLE_LOOK: Duration = Duration::from_millis(500);
 /// Shortest delay before a component switches itself off.
 const SHORTEST_DELAY: Duration = Duration::from_millis(50);
 /// Within the limit of 2 s for the shutdown of a port.

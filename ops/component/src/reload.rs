@@ -97,6 +97,13 @@ impl ComponentFile {
         Arc::clone(&self.latest.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
+    /// Returns whether the file on disk has the text of the latest version without findings. Reads
+    /// the file.
+    #[must_use]
+    pub fn is_saved(&self) -> bool {
+        bridge_node::read_text_file(&self.path).is_ok_and(|text| text == self.latest().text)
+    }
+
     /// Logs the findings, and returns the reason why the file is refused.
     fn refuse(&self, findings: Findings) -> String {
         let file = self.path.display();

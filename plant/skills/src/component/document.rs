@@ -123,12 +123,10 @@ fn component(
         skills,
     ] = reader.map(root, KEYS)?;
     // All values are read, so that all errors are reported.
-    let name = reader
-        .needed(name, "component", root.place)
-        .and_then(|node| read_name(node, reader));
-    let uri = reader
-        .needed(uri, "application_uri", root.place)
-        .and_then(|node| read_uri(node, Code::Uri, reader));
+    let name = reader.needed(name, "component", root.place);
+    let name = name.and_then(|node| read_name(node, reader));
+    let uri = reader.needed(uri, "application_uri", root.place);
+    let uri = uri.and_then(|node| read_uri(node, Code::Uri, reader));
     let namespace = reader
         .needed(namespace, "namespace", root.place)
         .and_then(|node| read_positive(node, Code::Namespace, reader));
@@ -136,10 +134,8 @@ fn component(
         Some(node) => read_endpoint(node, reader),
         None => Some(DEFAULT_ENDPOINT.to_owned()),
     };
-    let security = match security {
-        Some(node) => read_security(node, reader),
-        None => vec![Security::None],
-    };
+    let security =
+        security.map_or_else(|| vec![Security::None], |node| read_security(node, reader));
     let nodesets = read_nodesets(nodesets, folder, reader);
     let lds = lds.map_or(Some(Lds::Local), |node| read_lds(node, reader));
     let open = open.map_or(Some(false), |node| reader.boolean(node));
