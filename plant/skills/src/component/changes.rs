@@ -125,14 +125,16 @@ fn kind_of(before: Option<&Node>, after: Option<&Node>) -> Option<ChangeKind> {
     }
 }
 
-/// Returns the entries of a list by their names, each with its number from 1.
+/// Returns the entries of a list by their names, each with its number from 1. Entries without a
+/// name, such as `device: all`, have their number as name.
 fn named(list: Option<&Node>) -> Vec<(String, usize, &Node)> {
     let Some(Kind::List(nodes)) = list.map(|list| &list.kind) else {
         return Vec::new();
     };
     let named = (1..).zip(nodes).map(|(number, node)| {
         let name = node.get("name").and_then(Node::text);
-        (name.unwrap_or_default().to_owned(), number, node)
+        let name = name.map_or_else(|| number.to_string(), str::to_owned);
+        (name, number, node)
     });
     named.collect()
 }
@@ -239,6 +241,16 @@ mod tests {
             "# new\nnamespace: 9\n\ncomponent: a\n",
         );
         assert_eq!(changed(&after), Vec::<String>::new());
+    }
+
+    #[test]
+    fn values_without_a_name_are_compared_by_their_numbers() {
+        let before = "values:\n  - {device: Force}\n  - {device: Speed}\n";
+        assert_eq!(Component::changes(before, before), Vec::new());
+        let after = before.replace("Speed", "Current");
+        let paths = Component::changes(before, &after);
+        let paths: Vec<String> = paths.into_iter().map(|change| change.path).collect();
+        assert_eq!(paths, ["values.2"]);
     }
 
     #[test]
