@@ -252,7 +252,7 @@ impl State {
     fn of(values: &[Value]) -> Option<Self> {
         let [
             Value::Vector(pose),
-            Value::Vector([x, y, z, ..]),
+            Value::Vector([x, y, z, rx, ry, rz]),
             Value::I32(mode),
             Value::I32(safety),
             Value::U32(runtime),
@@ -267,7 +267,9 @@ impl State {
         };
         Some(Self {
             pose: *pose,
-            speed: (x * x + y * y + z * z).sqrt(),
+            speed: (x * x + y * y + z * z)
+                .sqrt()
+                .max(LEVER * (rx * rx + ry * ry + rz * rz).sqrt()),
             mode: *mode,
             safety: *safety,
             program: *runtime == PLAYING,
@@ -651,6 +653,8 @@ const SETTLED: Duration = Duration::from_millis(60);
 const BRAKED: Duration = Duration::from_millis(700);
 /// Below this speed the robot counts as stopped, m/s.
 const STILL: f64 = 0.001;
+/// Distance from the tool at which its rotation counts as speed, m.
+const LEVER: f64 = 0.1;
 
 #[cfg(test)]
 mod tests;

@@ -1,5 +1,5 @@
-//! A motion of the tool along a straight line, or of the joints: it accelerates, keeps its speed and
-//! decelerates.
+//! A motion of the tool along a straight line, or of the joints: it accelerates, keeps its speed
+//! and decelerates.
 
 use super::tidy;
 use crate::ur::REACH;
