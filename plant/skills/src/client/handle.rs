@@ -238,7 +238,9 @@ impl SkillHandle {
             .call(&self.found.nodes.skill, node, vec![run.into()])
             .await
             .map_err(|error| called(&error, &format!("ReadOutcome of {}", self.name())))?;
-        let [ended, succeeded, message, names, values, trace, unknown] = outputs.as_slice() else {
+        // Older components do not return `Unknown`.
+        let [ended, succeeded, message, names, values, trace, more @ ..] = outputs.as_slice()
+        else {
             return Err(self.unexpected("its ReadOutcome says something else"));
         };
         if *ended != Variant::Boolean(true) {
@@ -249,7 +251,7 @@ impl SkillHandle {
         Ok(Some(Outcome {
             run,
             succeeded: *succeeded == Variant::Boolean(true),
-            unknown: *unknown == Variant::Boolean(true),
+            unknown: more.first() == Some(&Variant::Boolean(true)),
             message: text(message),
             results,
             trace: super::find::texts(from_variant(trace)),
