@@ -84,7 +84,8 @@ impl MappingFile {
             let looked = tokio::task::spawn_blocking(|| poll.take()).await;
             let (now, found) = looked.unwrap_or_else(|error| {
                 let broken = Found::Refused(error.to_string(), String::new());
-                (polled, broken)
+                let read = polled.seen;
+                (Polled { read, ..polled }, broken)
             });
             polled = now;
             if self.adopt_found(found) {
