@@ -132,7 +132,12 @@ impl Runs for LocalRun {
             Ok(false) => return Err(SkillFault::Lost("the component ends".to_owned())),
             Err(_) => {
                 self.halt().await?;
-                return Err(SkillFault::TimedOut(within));
+                return Err(match self.skill.outcome(run) {
+                    Some(outcome) if outcome.unknown => {
+                        SkillFault::NotHalted(outcome.message.clone())
+                    }
+                    Some(_) | None => SkillFault::TimedOut(within),
+                });
             }
         }
         let outcome = self.skill.outcome(run);

@@ -480,7 +480,10 @@ impl Runs for SkillHandle {
         let ended = tokio::time::timeout(within, self.ended()).await;
         let Ok(state) = ended else {
             self.halt().await?;
-            return Err(SkillFault::TimedOut(within));
+            return match self.outcome(run, State::Halted).await {
+                Ok(outcome) if outcome.unknown => Err(SkillFault::NotHalted(outcome.message)),
+                Ok(_) | Err(_) => Err(SkillFault::TimedOut(within)),
+            };
         };
         self.outcome(run, state?).await
     }
