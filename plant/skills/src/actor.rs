@@ -274,11 +274,7 @@ impl Actor {
         let is_its_capability = method == Method::Suspend && is_running;
         let is_made_ready = given.readies && self.program.state() == State::Halted;
         if is_made_ready && self.now.needs_reset {
-            let text = format!(
-                "the outcome of run {} is unknown; Reset makes the skill ready",
-                self.now.run
-            );
-            return Err(Refusal::new(Code::InvalidState, text));
+            return Err(unknown_outcome(self.now.run));
         }
         if !self.program.is_executable(method) && !is_its_capability && !is_made_ready {
             return Err(not_now(method, self.program.state()));
@@ -425,7 +421,11 @@ impl Actor {
                 message = format!("{message}; {how}");
             }
             if self.work.is_none() {
-                self.end_without_work(message);
+                self.end_without_work(message.clone());
+                if self.now.needs_reset {
+                    self.take(Method::Halt, &message)?;
+                    return Err(unknown_outcome(self.now.run));
+                }
             }
         }
         if let Some(work) = &mut self.work {
@@ -928,6 +928,11 @@ fn refusal(refused: Refused) -> Refusal {
         Code::InvalidState
     };
     Refusal::new(code, refused.to_string())
+}
+
+fn unknown_outcome(run: u32) -> Refusal {
+    let text = format!("the outcome of run {run} is unknown; Reset makes the skill ready");
+    Refusal::new(Code::InvalidState, text)
 }
 
 fn still_at_work(run: RunId) -> Refusal {

@@ -50,7 +50,7 @@ enum Elsewhere {
 #[async_trait]
 impl Driver for Scripted {
     fn can_suspend(&self) -> bool {
-        matches!(self.how, How::WhenLet)
+        matches!(self.how, How::WhenLet | How::Lost)
     }
 
     fn halt_timeout(&self) -> Option<Duration> {
@@ -576,6 +576,20 @@ async fn stopped_work_without_a_known_end_needs_a_reset() {
         assert!(!bench.skill.shown().needs_reset);
         assert_eq!(bench.skill.execute(ME, Vec::new(), None).await, Ok(2));
     }
+}
+
+#[tokio::test]
+async fn a_reset_that_stops_suspended_work_without_a_known_end_halts() {
+    let bench = bench(How::Lost);
+    bench.run_to(State::Running).await;
+    bench.call(Method::Suspend).await.unwrap();
+    let refused = bench.call(Method::Reset).await.unwrap_err();
+    assert_eq!(refused.code, Code::InvalidState, "{refused}");
+    let shown = bench.skill.shown();
+    assert_eq!((shown.state, shown.needs_reset), (State::Halted, true));
+    assert!(bench.skill.outcome(1).unwrap().unknown);
+    bench.call(Method::Reset).await.unwrap();
+    assert_eq!(bench.skill.shown().state, State::Ready);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
