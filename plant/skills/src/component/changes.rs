@@ -246,7 +246,7 @@ mod tests {
     #[test]
     fn values_without_a_name_are_compared_by_their_numbers() {
         let before = "values:\n  - {device: Force}\n  - {device: Speed}\n";
-        assert_eq!(Component::changes(before, before), Vec::new());
+        assert_eq!(Component::changes(before, before), Vec::<Change>::new());
         let after = before.replace("Speed", "Current");
         let paths = Component::changes(before, &after);
         let paths: Vec<String> = paths.into_iter().map(|change| change.path).collect();
