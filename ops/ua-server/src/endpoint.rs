@@ -67,6 +67,7 @@ pub(crate) fn server(
 pub(crate) fn within(told: ServerLimits) -> Limits {
     let mut limits = limits::server(clients(told));
     limits.max_history_continuation_points = MOST_HISTORY_GOES_ON;
+    limits.operational.max_nodes_per_history_read_events = MOST_EVENT_HISTORIES;
     if let Some(subscriptions) = told.subscriptions {
         limits.subscriptions.max_subscriptions_per_session = usize::from(subscriptions);
     }
@@ -167,4 +168,6 @@ pub(crate) const APPLICATION_NAME: &str = "UA bridge server";
 pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
 /// Largest number of history continuation points of a session.
 const MOST_HISTORY_GOES_ON: usize = 100;
+/// Largest number of histories of events in a request. Only two nodes have one.
+const MOST_EVENT_HISTORIES: usize = 10;
 const SERVER_THREADS: usize = 2;

@@ -39,23 +39,23 @@ impl PastEvents {
         node: &mut HistoryNode,
         types: &dyn TypeTree,
     ) {
+        let most = usize::try_from(details.num_values_per_node).unwrap_or(usize::MAX);
+        let most = match most {
+            0 => MOST_RETURNED,
+            most => most.min(MOST_RETURNED),
+        };
+        let fields = details.filter.select_clauses.as_ref().map_or(0, Vec::len);
+        let most = most.min((MOST_FIELDS / fields.max(1)).max(1));
         let (_, filter) = ParsedEventFilter::new(details.filter.clone(), types);
-        let found = filter.and_then(|filter| self.found(details, node, (&filter, types)));
-        let mut found = match found {
+        let found = filter.and_then(|filter| self.found((details, most), node, (&filter, types)));
+        let (found, rest) = match found {
             Ok(found) => found,
             Err(status) => {
                 node.set_status(status);
                 return;
             }
         };
-        let most = usize::try_from(details.num_values_per_node).unwrap_or(usize::MAX);
-        let most = match most {
-            0 => MOST_RETURNED,
-            most => most.min(MOST_RETURNED),
-        };
-        let rest = found.split_off(most.min(found.len()));
         if !rest.is_empty() {
-            let rest = rest.into_iter().map(|(number, _)| number).collect();
             let rest = ContinuationPoint::new(Box::new(Rest(rest)));
             node.set_next_continuation_point(Some(rest));
         }
@@ -63,7 +63,7 @@ impl PastEvents {
             true => StatusCode::GoodNoData,
             false => StatusCode::Good,
         });
-        let events = found.into_iter().map(|(_, fields)| HistoryEventFieldList {
+        let events = found.into_iter().map(|fields| HistoryEventFieldList {
             event_fields: fields.event_fields,
         });
         node.set_result(HistoryEvent {
@@ -71,34 +71,45 @@ impl PastEvents {
         });
     }
 
-    /// Returns the events of a request, or the remaining events of its continuation point, in the
-    /// requested order.
+    /// Returns at most `most` events of a request, or of its continuation point, in the requested
+    /// order. Also returns the numbers of the selected events that follow.
     fn found(
         &self,
-        details: &ReadEventDetails,
+        (details, most): (&ReadEventDetails, usize),
         node: &HistoryNode,
         (filter, types): (&ParsedEventFilter, &dyn TypeTree),
-    ) -> Result<Vec<(u64, EventFieldList)>, StatusCode> {
-        let selected = |event: &ConditionEvent| filter.evaluate(event, 0, types);
-        if let Some(point) = node.continuation_point() {
-            let rest: &Rest = point.get().ok_or(StatusCode::BadContinuationPointInvalid)?;
-            let numbers = rest.0.iter();
-            let events = numbers.filter_map(|number| {
-                let at = self.events.partition_point(|(other, _)| other < number);
-                let (found, event) = self.events.get(at)?;
-                (found == number).then(|| Some((*number, selected(event)?)))?
-            });
-            return Ok(events.collect());
+    ) -> Result<(Vec<EventFieldList>, Vec<u64>), StatusCode> {
+        let numbers = match node.continuation_point() {
+            Some(point) => {
+                let rest: &Rest = point.get().ok_or(StatusCode::BadContinuationPointInvalid)?;
+                rest.0.clone()
+            }
+            None => self.numbers(details)?,
+        };
+        let (mut found, mut rest) = (Vec::new(), Vec::new());
+        for number in numbers {
+            let at = self.events.partition_point(|(other, _)| *other < number);
+            let event = self.events.get(at).filter(|(other, _)| *other == number);
+            let selected = event.and_then(|(_, event)| filter.evaluate(event, 0, types));
+            match selected {
+                Some(fields) if found.len() < most => found.push(fields),
+                Some(_) => rest.push(number),
+                None => {}
+            }
         }
+        Ok((found, rest))
+    }
+
+    /// Returns the numbers of the events of a time range, in the requested order.
+    fn numbers(&self, details: &ReadEventDetails) -> Result<Vec<u64>, StatusCode> {
         let span = (given(details.start_time), given(details.end_time));
-        let mut all: Vec<(i64, u64, &ConditionEvent)> = self
-            .events
-            .iter()
-            .map(|(number, event)| (event.time().ticks(), *number, event))
+        let events = self.events.iter();
+        let mut all: Vec<(i64, u64)> = events
+            .map(|(number, event)| (event.time().ticks(), *number))
             .collect();
         // The clock may have been set back.
-        all.sort_by_key(|(time, ..)| *time);
-        let times: Vec<i64> = all.iter().map(|(time, ..)| *time).collect();
+        all.sort_by_key(|(time, _)| *time);
+        let times: Vec<i64> = all.iter().map(|(time, _)| *time).collect();
         // The number of events is that of the events that the filter selects.
         let count = match span {
             (Some(_), Some(_)) => 0,
@@ -106,12 +117,11 @@ impl PastEvents {
             _ => u32::MAX,
         };
         let steps = steps(&times, span, (count, false))?;
-        let events = steps.into_iter().filter_map(|step| {
+        let numbers = steps.into_iter().filter_map(|step| {
             let Step::Value(at) = step else { return None };
-            let (_, number, event) = all.get(at)?;
-            Some((*number, selected(event)?))
+            all.get(at).map(|(_, number)| *number)
         });
-        Ok(events.collect())
+        Ok(numbers.collect())
     }
 }
 
@@ -119,3 +129,5 @@ impl PastEvents {
 const MOST_EVENTS: usize = 5_000;
 /// Largest number of events in a response.
 pub(crate) const MOST_RETURNED: usize = 1_000;
+/// Largest number of fields of all events in a response.
+const MOST_FIELDS: usize = 50_000;
