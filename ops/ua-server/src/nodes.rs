@@ -265,6 +265,9 @@ impl SpaceNodes {
             values.remove(topic.topic);
             past.remove(topic.topic);
         }
+        for topic in new {
+            past.describe(topic);
+        }
         drop(past);
         let mut left = HashMap::new();
         for node in gone.iter().flat_map(TopicNode::nodes) {

@@ -7,6 +7,7 @@ use opcua::types::StatusCode;
 use uadp::Timestamp;
 
 use super::store::{Store, Stored};
+use crate::layout::TopicNode;
 use crate::values::Shown;
 
 /// Past values, oldest first in each topic.
@@ -47,10 +48,14 @@ impl Past {
     }
 
     /// Adds the values of a file, and stores all further values in the file. Each topic gets the
-    /// mark `BadDataLost` for the time without the server (OPC 10000-11, 6.7).
+    /// mark `BadDataLost` for the time without the server (OPC 10000-11, 6.7), unless its last value
+    /// is such a mark: repeated restarts do not displace the values.
     pub(crate) fn keep_in(&mut self, store: Store, stored: Vec<Stored>) {
         let last = stored.iter().map(|(_, _, shown)| shown.stamp.server).max();
-        let next = stored.iter().map(|(_, number, _)| *number + 1).max();
+        let next = stored
+            .iter()
+            .map(|(_, number, _)| number.saturating_add(1))
+            .max();
         self.next = self.next.max(next.unwrap_or_default());
         self.store = Some(store);
         for (topic, number, shown) in stored {
@@ -64,9 +69,23 @@ impl Past {
             time: uadp::DateTime(last.ticks()),
             picoseconds: 0,
         });
-        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        let is_marked = |kept: &Kept| {
+            let newest = kept.values.back();
+            newest.is_some_and(|(_, shown)| shown.stamp.status == lost.stamp.status)
+        };
+        let unmarked = self.topics.iter().filter(|(_, kept)| !is_marked(kept));
+        let topics: Vec<TopicId> = unmarked.map(|(topic, _)| *topic).collect();
         for topic in topics {
             self.keep(topic, &lost);
+        }
+    }
+
+    /// Stores the type of a new topic in the file.
+    pub(crate) fn describe(&self, topic: &TopicNode) {
+        if let Some(store) = &self.store
+            && topic.historizing
+        {
+            store.describe(topic);
         }
     }
 

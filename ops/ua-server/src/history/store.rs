@@ -1,10 +1,10 @@
 //! The history in a file, from which it returns after a restart.
 //!
 //! The file has the same values as the memory, so that both have the same limits. A thread of its
-//! own writes the changes of half a second as one transaction. After a crash, the last half second
-//! is missing, and the file is intact. The file also has the states of the alarms.
+//! own writes the changes of half a second as one transaction. After a crash, at most the last
+//! second is missing, and the file is intact. The file also has the states of the alarms.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -58,6 +58,8 @@ struct Pending {
     bytes: usize,
     /// The number of the oldest value of each topic that has dropped values.
     floors: HashMap<TopicId, u64>,
+    /// The types of topics that were added after the start.
+    shapes: HashMap<TopicId, String>,
     /// The changed conditions by their nodes; `None` for removed conditions.
     conditions: HashMap<String, Option<Vec<u8>>>,
     /// Number of values that were not stored, because the file could not be written.
@@ -132,6 +134,13 @@ impl Store {
         self.shared.changed.notify_one();
     }
 
+    /// Stores the type of a new topic, so that a restart recognizes values of another type.
+    pub(crate) fn describe(&self, topic: &TopicNode) {
+        let shape = shape(topic);
+        self.shared.lock().shapes.insert(topic.topic, shape);
+        self.shared.changed.notify_one();
+    }
+
     /// Removes the values of a topic with a lower number.
     pub(crate) fn remove_before(&self, topic: TopicId, number: u64) {
         self.shared.lock().floors.insert(topic, number);
@@ -157,6 +166,11 @@ impl StoredConditions {
         self.change(node.to_string(), Some(bytes));
     }
 
+    /// Removes a condition.
+    pub(crate) fn remove(&self, node: &NodeId) {
+        self.change(node.to_string(), None);
+    }
+
     /// Returns true if conditions are stored.
     pub(crate) const fn is_kept(&self) -> bool {
         self.shared.is_some()
@@ -179,7 +193,10 @@ impl StoredConditions {
 
 impl Pending {
     fn is_empty(&self) -> bool {
-        self.values.is_empty() && self.floors.is_empty() && self.conditions.is_empty()
+        self.values.is_empty()
+            && self.floors.is_empty()
+            && self.shapes.is_empty()
+            && self.conditions.is_empty()
     }
 }
 
@@ -260,7 +277,7 @@ impl Shared {
         }
     }
 
-    /// Notes the removals and conditions of changes that were not written.
+    /// Notes the removals, types and conditions of changes that were not written.
     fn put_back(&self, changes: Pending) {
         let mut pending = self.lock();
         if pending.is_over {
@@ -268,6 +285,9 @@ impl Shared {
         }
         for (topic, floor) in changes.floors {
             pending.floors.entry(topic).or_insert(floor);
+        }
+        for (topic, shape) in changes.shapes {
+            pending.shapes.entry(topic).or_insert(shape);
         }
         for (node, bytes) in changes.conditions {
             pending.conditions.entry(node).or_insert(bytes);
@@ -295,6 +315,10 @@ fn write(database: &Database, changes: &Pending) -> Result<(), redb::Error> {
                 table.insert((key(*topic), *number), &encoded(shown)[..])?;
             }
         }
+        let mut table = transaction.open_table(SHAPES)?;
+        for (topic, shape) in &changes.shapes {
+            table.insert(key(*topic), shape.as_str())?;
+        }
         let mut table = transaction.open_table(CONDITIONS)?;
         for (node, bytes) in &changes.conditions {
             match bytes {
@@ -318,15 +342,20 @@ fn load(database: &Database, shapes: &HashMap<u64, String>) -> Result<Loaded, re
         let mut known = transaction.open_table(SHAPES)?;
         let mut table = transaction.open_table(VALUES)?;
         let mut others = Vec::new();
+        let mut same = HashSet::new();
         for row in known.iter()? {
             let (topic, shape) = row?;
             let is_same = shapes
                 .get(&topic.value())
                 .is_some_and(|is| is == shape.value());
-            if !is_same {
+            if is_same {
+                same.insert(topic.value());
+            } else {
                 others.push(topic.value());
             }
         }
+        // Values of topics without a type were received before the mapping had the topics.
+        others.extend(shapes.keys().filter(|topic| !same.contains(*topic)));
         for topic in others {
             table.retain_in((topic, 0)..=(topic, u64::MAX), |_, _| false)?;
             known.remove(topic)?;
