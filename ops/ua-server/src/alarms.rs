@@ -157,24 +157,6 @@ impl Entry {
         }
     }
 
-    /// Returns the text that distinguishes the alarm from other alarms of its variable; `None` for
-    /// conditions that are not stored.
-    fn alarm_text(&self) -> Option<String> {
-        let (alarm, _) = self.alarm.as_ref()?;
-        Some(format!("{alarm:?}"))
-    }
-
-    /// Continues with the condition before a restart, if it is that of the same alarm.
-    fn restore(&mut self, bytes: &[u8]) {
-        let text = self.alarm_text().unwrap_or_default();
-        if let Some(parts) = saved::decoded(bytes, &text)
-            && let Some((_, trigger)) = &mut self.alarm
-        {
-            trigger.restore(parts.state.levels);
-            self.condition.restore(parts);
-        }
-    }
-
     /// Returns the report of the levels of a value.
     fn report(&self, levels: Levels, reading: Option<&Reading>, quality: StatusCode) -> Report {
         let state = self.condition.state();
@@ -432,8 +414,8 @@ impl Alarms {
                 {
                     entry.condition = known.condition;
                     entry.alarm = known.alarm;
-                } else if let Some(bytes) = place.stored.lock().take(&node) {
-                    entry.restore(&bytes);
+                } else {
+                    place.restore(&mut entry);
                 }
                 entry.is_public = place.space.inner().is_public(&entry.identity.source);
                 inner.sources.insert(topic, Source::Value(node.clone()));
@@ -448,12 +430,9 @@ impl Alarms {
                 let entry = old.remove(&node).unwrap_or(entry);
                 inner.conditions.insert(node, entry);
             }
-            wanted.extend(
-                inner
-                    .conditions
-                    .values()
-                    .map(|entry| Arc::clone(&entry.identity)),
-            );
+            place.remove_stored(old.keys());
+            let conditions = inner.conditions.values();
+            wanted.extend(conditions.map(|entry| Arc::clone(&entry.identity)));
             let any = !inner.sources.is_empty()
                 || !inner.conditions.is_empty()
                 || inner.reports.due().is_some();

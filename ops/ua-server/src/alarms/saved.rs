@@ -1,10 +1,11 @@
 //! Conditions as they are stored over a restart: an acknowledged alarm stays acknowledged, and a
 //! disabled condition disabled.
 
-use opcua::types::{ByteString, DateTime, LocalizedText, StatusCode, UAString};
+use opcua::types::{ByteString, DateTime, LocalizedText, NodeId, StatusCode, UAString};
 use serde::{Deserialize, Serialize};
 
 use super::condition::{Condition, Levels, Parts, Stamp, State, TwoState};
+use super::{Entry, Place};
 
 /// The stored form of a condition. Times are ticks of 100 ns.
 #[derive(Serialize, Deserialize)]
@@ -26,6 +27,50 @@ struct Saved {
     event: (Vec<u8>, i64),
     events: Vec<Vec<u8>>,
     unacknowledged: Vec<Vec<u8>>,
+}
+
+impl Entry {
+    /// Returns the text that distinguishes the alarm from other alarms of its variable; `None` for
+    /// conditions that are not stored.
+    pub(super) fn alarm_text(&self) -> Option<String> {
+        let (alarm, _) = self.alarm.as_ref()?;
+        Some(format!("{alarm:?}"))
+    }
+
+    /// Continues with the condition before a restart, if it is that of the same alarm. Returns false
+    /// otherwise.
+    pub(super) fn restore(&mut self, bytes: &[u8]) -> bool {
+        let text = self.alarm_text().unwrap_or_default();
+        let Some(parts) = decoded(bytes, &text) else {
+            return false;
+        };
+        let Some((_, trigger)) = &mut self.alarm else {
+            return false;
+        };
+        trigger.restore(parts.state.levels);
+        self.condition.restore(parts);
+        true
+    }
+}
+
+impl Place {
+    /// Continues with the stored condition of the same alarm. Any other stored condition of the node
+    /// is removed: if the alarm returned, it would otherwise continue with an outdated state.
+    pub(super) fn restore(&self, entry: &mut Entry) {
+        let mut stored = self.stored.lock();
+        let bytes = stored.take(&entry.identity.node);
+        if !bytes.is_some_and(|bytes| entry.restore(&bytes)) {
+            stored.remove(&entry.identity.node);
+        }
+    }
+
+    /// Removes stored conditions, whose alarms do not exist any more.
+    pub(super) fn remove_stored<'n>(&self, nodes: impl Iterator<Item = &'n NodeId>) {
+        let stored = self.stored.lock();
+        for node in nodes {
+            stored.remove(node);
+        }
+    }
 }
 
 /// Encodes a condition of an alarm.
@@ -65,7 +110,7 @@ pub(super) fn encoded(condition: &Condition, alarm: &str) -> Vec<u8> {
 
 /// Decodes a condition of an alarm. Returns `None` for the condition of another alarm, and for
 /// bytes that are no condition.
-pub(super) fn decoded(bytes: &[u8], alarm: &str) -> Option<Parts> {
+fn decoded(bytes: &[u8], alarm: &str) -> Option<Parts> {
     let saved: Saved = serde_json::from_slice(bytes).ok()?;
     if saved.alarm != alarm {
         return None;
