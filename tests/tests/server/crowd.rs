@@ -48,7 +48,7 @@ fn clients_that_vanish_leave_neither_memory_nor_work_behind() {
         return;
     };
     let clients = std::env::var("UA_CROWD").ok();
-    let clients = clients.and_then(|text| text.parse().ok()).unwrap_or(45);
+    let clients = clients.and_then(|text| text.parse().ok()).unwrap_or(90);
     let server = serving(&cell, CROWD);
     visit(&cell, 2 * AT_ONCE);
     let before = anonymous(server.id());
@@ -74,7 +74,7 @@ fn a_server_with_a_hundred_sessions_ends_soon() {
     let asked = Instant::now();
     server.signal(Signal::SIGTERM);
     assert!(server.wait_for_end(SOON).success());
-    // 2 s on an idle machine.
+    // 2 s on an idle machine. A delay of 100 ms for each session would take longer.
     let took = asked.elapsed();
-    assert!(took < Duration::from_secs(5), "{took:?}");
+    assert!(took < Duration::from_secs(10), "{took:?}");
 }
