@@ -202,8 +202,8 @@ document! {
         /// MiB of all of them together, 1 to 16384; default 64.
         #[schemars(range(min = 1, max = 16384))]
         megabytes: u16,
-        /// File in which ua-server stores the history and the states of alarms, so that they survive
-        /// a restart; it is created if it is missing. Without it, they are in memory only.
+        /// File in which ua-server stores the history and the states of alarms, so that they
+        /// survive a restart; it is created if it is missing. Without it, they are in memory only.
         file: String,
     }
 

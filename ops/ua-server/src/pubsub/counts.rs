@@ -152,8 +152,8 @@ struct Shown {
 }
 
 impl Diagnostics {
-    /// Adds the counters below a component. Also returns the method that resets them, and the object
-    /// of the live values.
+    /// Adds the counters below a component. Also returns the method that resets them, and the
+    /// object of the live values.
     pub(super) fn insert(
         tree: &mut Tree<'_>,
         above: &At,

@@ -109,8 +109,8 @@ impl Insert<'_> {
         self.tree.property("MimeType", mime, UA_BINARY, &file);
     }
 
-    /// Adds a component with its Status, and with counters if it has any. Also returns the object of
-    /// the live values.
+    /// Adds a component with its Status, and with counters if it has any. Also returns the object
+    /// of the live values.
     fn part(
         &mut self,
         kind: Kind,
@@ -533,8 +533,8 @@ pub(super) fn milliseconds(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
 }
 
-/// The identifier of the node of the connection, and the begin of the identifiers below it of groups
-/// of readers.
+/// The identifier of the node of the connection. The identifiers of groups of readers continue with
+/// `READERS`.
 const CONNECTION_ID: &str = "PubSub.space";
 const READERS: &str = ".readers ";
 /// The BrowseName of the connection.

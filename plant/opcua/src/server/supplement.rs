@@ -202,7 +202,7 @@ impl Supplement {
         let node = &wanted.node_id;
         match wanted.attribute_id {
             AttributeId::AccessLevelEx => {
-                // Reads and writes of arrays are atomic, and parts of arrays can be written, so that
+                // Reads and writes of arrays are atomic, and parts of arrays can be written, so
                 // the further bits are 0.
                 let level = facts.access_level?;
                 Some(Variant::UInt32(level.into()))
