@@ -280,6 +280,12 @@ mod tests {
         past.close();
         // The file is free again.
         drop(opened());
+        // A second restart without a new value adds no second mark.
+        let lost = Shown::nothing(StatusCode::BadDataLost);
+        let mut past = Past::new(9, 1 << 20);
+        past.keep_in(opened().0, vec![(topic, 0, value(4, 1)), (topic, 1, lost)]);
+        assert_eq!(past.of(topic).len(), 2);
+        past.close();
         drop(std::fs::remove_file(&file));
     }
 

@@ -598,6 +598,21 @@ mod tests {
     }
 
     #[test]
+    fn values_of_topics_that_were_added_later_need_a_type() {
+        let scratch = Scratch::new("later");
+        let topics = [node(1, BuiltinType::Double), node(2, BuiltinType::Double)];
+        let [one, other] = [topics[0].topic, topics[1].topic];
+        let (store, _) = scratch.open(&[]);
+        store.describe(&topics[0]);
+        store.keep(one, 0, &value(1.0));
+        store.keep(other, 1, &value(1.0));
+        drop(store);
+        let (_store, stored) = scratch.open(&topics);
+        assert_eq!(numbers(&stored, one), [0]);
+        assert!(numbers(&stored, other).is_empty());
+    }
+
+    #[test]
     fn conditions_are_there_again_and_those_without_an_alarm_are_removed() {
         let scratch = Scratch::new("conditions");
         let [one, other] = ["one", "other"].map(|name| NodeId::new(1, name));
