@@ -378,7 +378,7 @@ async fn connect(
     });
     let opened = opened.await;
     let driving = AbortOnDrop(Some(driving));
-    opened.map_err(|_| format!("{} refuses the session", shared.url))??;
+    opened.map_err(|_| format!("{} does not open the session in time", shared.url))??;
     let limits = OperationLimits::default();
     let (namespaces, started) = timeout(within, what_it_is(&session, &limits))
         .await
