@@ -681,8 +681,8 @@ fn prepared(core: &mut AddressSpace) {
     }
 }
 
-/// Sets the limits of the node manager, restores the history, and shows the PubSub configuration and
-/// the conditions in the address space.
+/// Sets the limits of the node manager, restores the history, and shows the PubSub configuration
+/// and the conditions in the address space.
 fn show_limits(
     mapping: &Arc<Mapping>,
     layout: &Arc<Layout>,

@@ -220,7 +220,8 @@ impl PubSub {
     }
 
     /// Adds the nodes of the readers if they do not exist and one of `nodes` is the connection, a
-    /// group of readers, or a node below it. Cells have many readers, and most clients look at none.
+    /// group of readers, or a node below it. Cells have many readers, and most clients look
+    /// at none.
     pub(crate) fn look_for_readers<'n>(&self, mut nodes: impl Iterator<Item = &'n NodeId>) {
         if !self.has_no_readers.load(Ordering::Relaxed) || !nodes.any(insert::leads_to_readers) {
             return;

@@ -37,8 +37,8 @@ impl Entry {
         Some(format!("{alarm:?}"))
     }
 
-    /// Continues with the condition before a restart, if it is that of the same alarm. Returns false
-    /// otherwise.
+    /// Continues with the condition before a restart, if it is that of the same alarm. Returns
+    /// false otherwise.
     pub(super) fn restore(&mut self, bytes: &[u8]) -> bool {
         let text = self.alarm_text().unwrap_or_default();
         let Some(parts) = decoded(bytes, &text) else {
@@ -54,8 +54,8 @@ impl Entry {
 }
 
 impl Place {
-    /// Continues with the stored condition of the same alarm. Any other stored condition of the node
-    /// is removed: if the alarm returned, it would otherwise continue with an outdated state.
+    /// Continues with the stored condition of the same alarm. Any other stored condition of the
+    /// node is removed: if its alarm returned, it would continue with an outdated state.
     pub(super) fn restore(&self, entry: &mut Entry) {
         let mut stored = self.stored.lock();
         let bytes = stored.take(&entry.identity.node);

@@ -48,8 +48,8 @@ impl Past {
     }
 
     /// Adds the values of a file, and stores all further values in the file. Each topic gets the
-    /// mark `BadDataLost` for the time without the server (OPC 10000-11, 6.7), unless its last value
-    /// is such a mark: repeated restarts do not displace the values.
+    /// mark `BadDataLost` for the time without the server (OPC 10000-11, 6.7), unless its last
+    /// value is such a mark: repeated restarts do not displace the values.
     pub(crate) fn keep_in(&mut self, store: Store, stored: Vec<Stored>) {
         let last = stored.iter().map(|(_, _, shown)| shown.stamp.server).max();
         let next = stored
