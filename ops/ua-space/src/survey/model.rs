@@ -18,6 +18,7 @@ use messages::TypeName;
 use uadp::BuiltinType;
 
 use crate::exit::Failure;
+use crate::live::harmless;
 
 /// The values and calls of a model.
 #[derive(Clone, Debug, Default)]
@@ -122,7 +123,8 @@ impl Finding {
 
 impl fmt::Display for Finding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.line, self.message)
+        // Names of XML elements may contain control characters.
+        write!(f, "{}: {}", self.line, harmless(&self.message))
     }
 }
 

@@ -563,7 +563,19 @@ impl Class {
             | BuiltinType::Float
             | BuiltinType::Double => Self::Number,
             BuiltinType::String => Self::Text,
-            _ => Self::Other,
+            BuiltinType::DateTime
+            | BuiltinType::Guid
+            | BuiltinType::ByteString
+            | BuiltinType::XmlElement
+            | BuiltinType::NodeId
+            | BuiltinType::ExpandedNodeId
+            | BuiltinType::StatusCode
+            | BuiltinType::QualifiedName
+            | BuiltinType::LocalizedText
+            | BuiltinType::ExtensionObject
+            | BuiltinType::DataValue
+            | BuiltinType::Variant
+            | BuiltinType::DiagnosticInfo => Self::Other,
         }
     }
 

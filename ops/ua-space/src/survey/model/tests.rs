@@ -192,3 +192,9 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn findings_send_no_commands_to_a_terminal() {
+    let finding = Finding::new(1, "the element of Ros1\u{1b}[31m");
+    assert_eq!(finding.to_string(), "1: the element of Ros1\\u{1b}[31m");
+}

@@ -5,9 +5,13 @@
 //! multiplicities, and metadata usages (`@X {..}`, `metadata X about y {..}`, `#X attribute ..`).
 //! Other statements are skipped by their `;` or braces.
 
+mod words;
+
 use std::collections::HashMap;
 use std::iter::Peekable;
 use std::str::Chars;
+
+use words::{KINDS, PREFIXES, SKIPPED, TEXTUAL};
 
 use super::{Applied, DEEPEST, Element, ElementKind, Finding, MOST_ELEMENTS, Tag, shown};
 
@@ -58,14 +62,18 @@ impl Token {
                 text,
                 is_quoted: false,
             } => Some(text),
-            _ => None,
+            Lexeme::Word { .. }
+            | Lexeme::Text(_)
+            | Lexeme::Number(_)
+            | Lexeme::Symbol(_)
+            | Lexeme::Comment => None,
         }
     }
 
     fn word(&self) -> Option<&str> {
         match &self.what {
             Lexeme::Word { text, .. } => Some(text),
-            _ => None,
+            Lexeme::Text(_) | Lexeme::Number(_) | Lexeme::Symbol(_) | Lexeme::Comment => None,
         }
     }
 }
@@ -275,7 +283,9 @@ impl Parser {
                     self.statement.clear();
                 }
             }
-            _ => self.statement.push(token),
+            Lexeme::Word { .. } | Lexeme::Text(_) | Lexeme::Number(_) | Lexeme::Symbol(_) => {
+                self.statement.push(token);
+            }
         }
         if self.statement.len() > LONGEST {
             let line = self.statement.first().map_or(1, |first| first.line);
@@ -301,6 +311,13 @@ impl Parser {
 
     /// Interprets a statement up to its `;` or `{`. Returns the meaning of its braces.
     fn begin(&mut self, statement: &[Token]) -> Result<Body, Finding> {
+        if self.metadata.len() >= MOST_ELEMENTS || self.findings.len() >= MOST_ELEMENTS {
+            let line = statement.first().map_or(1, |first| first.line);
+            return Err(Finding::new(
+                line,
+                format!("more than {MOST_ELEMENTS} metadata usages or findings are not read"),
+            ));
+        }
         match self.body() {
             Some(Body::Metadata(at)) => {
                 self.value(at, statement);
@@ -463,24 +480,7 @@ impl Parser {
                 rest = behind;
             }
         }
-        let value_at = rest
-            .iter()
-            .position(|token| token.is("=") || token.is(":="));
-        let declared = rest
-            .get(..value_at.unwrap_or(rest.len()))
-            .unwrap_or_default();
-        let is_typing = |token: &Token| token.is(":") || token.keyword() == Some("by");
-        let typing = declared.iter().position(is_typing);
-        let typed = typing
-            .and_then(|at| declared.get(at + 1..))
-            .unwrap_or_default();
-        // A port has the conjugated type after `~`.
-        let typed = match typed.split_first() {
-            Some((token, behind)) if token.is("~") => behind,
-            _ => typed,
-        };
-        node.type_name = qualified(typed).and_then(|(mut path, _)| path.pop());
-        node.is_array = is_array(declared);
+        (node.type_name, node.is_array) = typing(rest);
         if !node.name.is_empty() {
             let key = (parent, node.name.clone());
             self.children.entry(key).or_insert(at);
@@ -602,6 +602,29 @@ fn qualified(tokens: &[Token]) -> Option<(Vec<String>, usize)> {
     Some((path, count))
 }
 
+/// Returns the last segment of the name of the type behind the name of an element, and whether the
+/// element has several values.
+fn typing(rest: &[Token]) -> (Option<String>, bool) {
+    let value_at = rest
+        .iter()
+        .position(|token| token.is("=") || token.is(":="));
+    let declared = rest
+        .get(..value_at.unwrap_or(rest.len()))
+        .unwrap_or_default();
+    let is_typing = |token: &Token| token.is(":") || token.keyword() == Some("by");
+    let colon = declared.iter().position(is_typing);
+    let typed = colon
+        .and_then(|at| declared.get(at + 1..))
+        .unwrap_or_default();
+    // A port has the conjugated type after `~`.
+    let typed = match typed.split_first() {
+        Some((token, behind)) if token.is("~") => behind,
+        _ => typed,
+    };
+    let type_name = qualified(typed).and_then(|(mut path, _)| path.pop());
+    (type_name, is_array(declared))
+}
+
 /// Returns true if the multiplicity allows several values.
 fn is_array(declared: &[Token]) -> bool {
     let start = declared.iter().position(|token| token.is("["));
@@ -627,7 +650,7 @@ fn literal(tokens: &[Token]) -> Option<String> {
         },
         [minus, number] if minus.is("-") => match &number.what {
             Lexeme::Number(text) => Some(format!("-{text}")),
-            _ => None,
+            Lexeme::Word { .. } | Lexeme::Text(_) | Lexeme::Symbol(_) | Lexeme::Comment => None,
         },
         _ => None,
     }
@@ -635,92 +658,3 @@ fn literal(tokens: &[Token]) -> Option<String> {
 
 /// Maximum number of tokens of a statement.
 const LONGEST: usize = 10_000;
-/// Words that precede a comment and end with it.
-const TEXTUAL: [&str; 5] = ["comment", "doc", "language", "locale", "rep"];
-/// Words that begin a statement without a named element.
-const SKIPPED: [&str; 27] = [
-    "accept",
-    "alias",
-    "assert",
-    "assign",
-    "assume",
-    "bind",
-    "comment",
-    "connect",
-    "dependency",
-    "doc",
-    "else",
-    "expose",
-    "filter",
-    "first",
-    "for",
-    "if",
-    "import",
-    "language",
-    "locale",
-    "loop",
-    "merge",
-    "rep",
-    "satisfy",
-    "send",
-    "then",
-    "transition",
-    "while",
-];
-/// Words before the kind of an element.
-const PREFIXES: [&str; 18] = [
-    "abstract",
-    "composite",
-    "constant",
-    "default",
-    "derived",
-    "end",
-    "in",
-    "individual",
-    "inout",
-    "library",
-    "nonunique",
-    "ordered",
-    "out",
-    "readonly",
-    "snapshot",
-    "standard",
-    "timeslice",
-    "variant",
-];
-/// Words of the kinds of elements.
-const KINDS: [&str; 33] = [
-    "action",
-    "actor",
-    "allocation",
-    "analysis",
-    "attribute",
-    "calc",
-    "case",
-    "concern",
-    "connection",
-    "constraint",
-    "enum",
-    "event",
-    "exhibit",
-    "flow",
-    "include",
-    "interface",
-    "item",
-    "message",
-    "objective",
-    "occurrence",
-    "package",
-    "part",
-    "perform",
-    "port",
-    "ref",
-    "rendering",
-    "requirement",
-    "state",
-    "subject",
-    "use",
-    "variation",
-    "verification",
-    "view",
-];
