@@ -79,10 +79,11 @@ impl Job {
             "running" => step,
             ended => ended,
         };
-        match self.remark().as_str() {
+        let line = match self.remark().as_str() {
             "" => format!("job {}: {of}", self.job),
             remark => format!("job {}: {of}: {remark}", self.job),
-        }
+        };
+        harmless(&line)
     }
 
     /// Returns how `--wait` ends, if the job has ended.
@@ -126,7 +127,7 @@ fn follow(number: u64, at: &SourceAt) -> Result<(), Failure> {
                 return end;
             }
             if last.as_ref() != Some(&job) {
-                say(&harmless(&job.line()))?;
+                say(&job.line())?;
                 last = Some(job);
             }
             tokio::time::sleep(AGAIN).await;
