@@ -154,7 +154,8 @@ impl Board {
         let Self {
             topics, timeline, ..
         } = self;
-        if has_changed && let Some(entry) = topics.get(&topic) {
+        let is_event = has_changed || timeline.is_behind(topic);
+        if is_event && let Some(entry) = topics.get(&topic) {
             timeline.value(topic, entry, at);
         }
         if let Some(watched) = self.watched.get_mut(&topic) {

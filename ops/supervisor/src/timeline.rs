@@ -1,7 +1,7 @@
 //! The events of the cell over time: changes of discrete values, states of skills, and calls.
 //!
-//! Pure: times are parameters. The timeline is bounded in events, and in events of each topic per
-//! second, because any host of the group can publish.
+//! Pure: times are parameters. The timeline is bounded in events, in events of each topic per second,
+//! and in requests and responses per second, because any host of the group can publish.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -26,6 +26,8 @@ pub(crate) struct Timeline {
     named: BTreeSet<TopicId>,
     /// The last requests and responses, because they are repeated.
     calls: VecDeque<Call>,
+    /// The second of the last requests and responses, and their number.
+    called: (u64, u32),
     /// The time of the day at the start of the page, in milliseconds since 1970.
     start_ms: Option<i64>,
     /// The name of the recording whose events are shown.
@@ -36,6 +38,8 @@ pub(crate) struct Timeline {
 #[derive(Debug, Default)]
 struct Last {
     text: String,
+    /// The present text, if it exceeded the limit and is not shown.
+    left_out: Option<String>,
     /// The second of the last events, and their number.
     second: u64,
     count: u32,
@@ -96,17 +100,24 @@ impl Timeline {
         };
         let last = self.topics.entry(topic).or_default();
         if last.text == text {
+            if last.left_out.take().is_some() {
+                self.left_out += 1;
+            }
             return;
         }
         let second = at.since.as_secs();
         if last.second != second {
             (last.second, last.count) = (second, 0);
         }
-        last.text.clone_from(&text);
         if last.count >= MOST_PER_SECOND {
-            self.left_out += 1;
+            if last.left_out.as_ref() != Some(&text) {
+                self.left_out += 1;
+                last.left_out = Some(text);
+            }
             return;
         }
+        last.text.clone_from(&text);
+        last.left_out = None;
         last.count += 1;
         let severity = match (quality(entry.status, false).0, kind) {
             ("good", Kind::State) => of_state(&text),
@@ -126,11 +137,27 @@ impl Timeline {
         self.push(event, entry.source, at);
     }
 
+    /// Returns true if the present value of the topic exceeded the limit and is not shown. Its
+    /// repetition is shown.
+    pub(crate) fn is_behind(&self, topic: TopicId) -> bool {
+        let last = self.topics.get(&topic);
+        last.is_some_and(|last| last.left_out.is_some())
+    }
+
     /// Takes a request or response. Repetitions are no events.
     pub(crate) fn call(&mut self, call: Call, at: At) {
         if self.calls.contains(&call) {
             return;
         }
+        let second = at.since.as_secs();
+        if self.called.0 != second {
+            self.called = (second, 0);
+        }
+        if self.called.1 >= MOST_CALLS_PER_SECOND {
+            self.left_out += 1;
+            return;
+        }
+        self.called.1 += 1;
         if self.calls.len() >= MOST_CALLS {
             self.calls.pop_front();
         }
@@ -302,6 +329,8 @@ const MOST_NAMED: usize = 2_000;
 /// Faster changes of a topic are counted and not shown.
 const MOST_PER_SECOND: u32 = 5;
 const MOST_CALLS: usize = 256;
+/// Further requests and responses of all calls are counted and not shown.
+const MOST_CALLS_PER_SECOND: u32 = 50;
 const MOST_PER_DATAGRAM: usize = 16;
 const LONGEST_TEXT: usize = 80;
 
@@ -413,6 +442,40 @@ mod tests {
         }
         let shown = board.timeline.after(0, at(0).since);
         assert_eq!(shown["events"].as_array().unwrap().len(), MOST_EVENTS);
+    }
+
+    #[test]
+    fn a_value_beyond_the_limit_is_shown_with_its_repetition() {
+        let mut board = Board::default();
+        for number in 0..7_u8 {
+            take(&mut board, "ua_1_2_10", &[1, 0, 3, number], 1000);
+        }
+        assert_eq!(board.timeline.last(), 5);
+        for millis in [2000, 3000] {
+            take(&mut board, "ua_1_2_10", &[1, 0, 3, 6], millis);
+        }
+        assert_eq!(board.timeline.last(), 6);
+        assert_eq!(
+            board.timeline.after(5, at(0).since)["events"][0]["text"],
+            "6"
+        );
+        assert_eq!(board.timeline.after(0, at(0).since)["left_out"], 2);
+    }
+
+    #[test]
+    fn requests_of_all_calls_are_limited_and_the_rest_is_counted() {
+        let mut timeline = Timeline::default();
+        for id in 0..200 {
+            let call = Call {
+                topic: topic("ua_1_2_61"),
+                is_request: true,
+                id,
+                is_done: false,
+            };
+            timeline.call(call, at(1000));
+        }
+        assert_eq!(timeline.last(), 50);
+        assert_eq!(timeline.after(0, at(0).since)["left_out"], 150);
     }
 
     #[test]
