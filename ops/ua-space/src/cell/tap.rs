@@ -8,7 +8,6 @@ use std::time::Duration;
 use mappings::TopicId;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
 use super::pages::{self, Page};
@@ -16,6 +15,7 @@ use super::pages_of_this_host;
 use crate::arguments::{Tap, Target};
 use crate::exit::Failure;
 use crate::http::Server;
+use crate::interrupt::Interrupt;
 use crate::iso_time;
 use crate::live::{fitting, harmless, json};
 use crate::report::warn;
@@ -43,10 +43,7 @@ async fn run(arguments: &Tap) -> Result<(), Failure> {
             }),
         }
     }
-    let on =
-        |kind| signal(kind).map_err(|error| Failure::Io(format!("cannot catch signals: {error}")));
-    let (mut interrupt, mut terminate) =
-        (on(SignalKind::interrupt())?, on(SignalKind::terminate())?);
+    let mut interrupt = Interrupt::catch()?;
     let limit = arguments.seconds.map(Duration::try_from_secs_f64);
     let end = limit
         .and_then(Result::ok)
@@ -55,19 +52,20 @@ async fn run(arguments: &Tap) -> Result<(), Failure> {
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut told = Told::new(arguments, topic);
     loop {
-        let is_over = tokio::select! {
-            biased;
-            Some(()) = interrupt.recv() => true,
-            Some(()) = terminate.recv() => true,
-            _ = ticks.tick() => false,
+        let asked = async {
+            ticks.tick().await;
+            let mut events = Vec::new();
+            for program in &mut programs {
+                events.extend(program.events(topic).await);
+            }
+            events
         };
-        if is_over {
-            break;
-        }
-        let mut events = Vec::new();
-        for program in &mut programs {
-            events.extend(program.events(topic).await);
-        }
+        // A program may take long to answer.
+        let mut events = tokio::select! {
+            biased;
+            () = interrupt.received() => break,
+            events = asked => events,
+        };
         events.sort_by_key(|(_, event)| event.at_us);
         if programs.iter().all(|program| program.fault.is_some()) {
             let faults = programs.iter().filter_map(|program| program.fault.clone());
@@ -203,10 +201,9 @@ impl Program {
             }
         };
         let Ok(answer) = serde_json::from_str::<Answer>(&answer.body) else {
-            self.fault = Some(format!(
-                "{} at {}: not the events of a topic",
-                self.name, self.url
-            ));
+            let why = format!("{} at {}: not the events of a topic", self.name, self.url);
+            warn(&why);
+            self.fault = Some(why);
             return Vec::new();
         };
         (self.from, self.lost) = (answer.next, answer.lost);
