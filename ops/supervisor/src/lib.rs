@@ -5,10 +5,10 @@
 //! that status, without files: HTML, styles and scripts are part of the program.
 //!
 //! Reading order: `board` (the last value of each topic), `announced` (names and units),
-//! `program` (rows of programs), `skill` (tiles of skills), `timeline` (events), `view` (what a browser is sent),
-//! `stream` (server-sent events), `fetch` (the status of other programs), `page` (state and
-//! events), `session` (signed-in users), `encode` (forms), `operations` (commands), `proxy`,
-//! `responses` and `site` (requests).
+//! `program` (rows of programs), `skill` (tiles of skills), `timeline` (events), `view` (what a
+//! browser is sent), `stream` (server-sent events), `fetch` (the status of other programs), `page`
+//! (state and events), `session` (signed-in users), `encode` (forms), `operations` (commands),
+//! `proxy`, `responses` and `site` (requests).
 
 mod announced;
 mod board;

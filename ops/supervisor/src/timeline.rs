@@ -1,7 +1,7 @@
 //! The events of the cell over time: changes of discrete values, states of skills, and calls.
 //!
-//! Pure: times are parameters. The timeline is bounded in events, in events of each topic per second,
-//! and in requests and responses per second, because any host of the group can publish.
+//! Pure: times are parameters. The timeline is bounded in events, in events of each topic per
+//! second, and in requests and responses per second, because any host of the group can publish.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 

@@ -54,17 +54,17 @@ pub(crate) enum Verb {
     ///
     /// Inspects SysML models, ROS graphs, running OPC UA servers and NodeSets, or all discovered
     /// sources, and writes a commented mapping that runs. A model has a stereotype at each property
-    /// that crosses (ua-space new profile, ua-space new sysml). Topics and nodes of several sources with the same name
-    /// and type are joined, and marked as guesses. Topics of ROS itself (logs, actions, transforms)
-    /// are left out, with a comment.
+    /// that crosses (ua-space new profile, ua-space new sysml). Topics and nodes of several sources
+    /// with the same name and type are joined, and marked as guesses. Topics of ROS itself (logs,
+    /// actions, transforms) are left out, with a comment.
     ///
     /// An existing file keeps every byte: with --merge new entries are appended. Topics or nodes
     /// that its comments name are not proposed again, unless this command commented them out
     /// because a definition was missing.
     ///
-    /// Exit codes: 0 done, 64 usage, 65 a NodeSet or model is malformed, 69 a master, domain or server is
-    /// not available, 74 a file cannot be read or written, or exists and --merge is missing, 78 the
-    /// existing file cannot run.
+    /// Exit codes: 0 done, 64 usage, 65 a NodeSet or model is malformed, 69 a master, domain or
+    /// server is not available, 74 a file cannot be read or written, or exists and --merge is
+    /// missing, 78 the existing file cannot run.
     Init(Init),
     /// Explain the code of a finding, with an example
     ///
@@ -279,8 +279,9 @@ pub(crate) enum Verb {
     /// Lists each skill that the MES considered for each need of the process, and why it was chosen
     /// or not. Without a process: the processes that the MES knows.
     ///
-    /// Exit codes: 0 the process can run, 1 a component is missing, 64 usage, or an unknown process,
-    /// 65 the answer was not understood, 69 no answer in time, 74 the output cannot be written.
+    /// Exit codes: 0 the process can run, 1 a component is missing, 64 usage, or an unknown
+    /// process, 65 the answer was not understood, 69 no answer in time, 74 the output cannot be
+    /// written.
     Plan(PlanArguments),
     /// Change the sources of the knowledge of the plant while ua-mes runs
     ///
@@ -294,8 +295,8 @@ pub(crate) enum Verb {
     /// Start, list and stop jobs: runs of the processes that ua-mes knows
     ///
     /// Exit codes: 0 done, 1 the job failed (with --wait), 64 usage, or an unknown process or job,
-    /// 69 no answer in time, the outcome of the job is unknown, or the user may not run jobs, 74 the
-    /// output cannot be written.
+    /// 69 no answer in time, the outcome of the job is unknown, or the user may not run jobs, 74
+    /// the output cannot be written.
     Job(JobArguments),
     /// Show the sequence of actions that reaches a goal, with the proof of each step
     ///

@@ -1,4 +1,5 @@
-//! Inspects ROS graphs, OPC UA servers, NodeSets and SysML models for `init` and `check --environment`.
+//! Inspects ROS graphs, OPC UA servers, NodeSets and SysML models for `init` and `check
+//! --environment`.
 
 pub(crate) mod data_types;
 pub(crate) mod model;

@@ -21,12 +21,12 @@ pub(crate) struct Look {
     /// Time to listen
     #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
     pub(crate) seconds: f64,
-    /// Also ask this discovery server, beside the server of this host and the announced servers. May
-    /// be repeated
+    /// Also ask this discovery server, beside the server of this host and the announced servers.
+    /// May be repeated
     #[arg(long, value_name = "URL")]
     pub(crate) lds: Vec<String>,
-    /// Try these addresses, as 192.168.0.0/24, for servers that do not announce themselves. /16 is the
-    /// widest. May be repeated
+    /// Try these addresses, as 192.168.0.0/24, for servers that do not announce themselves. /16 is
+    /// the widest. May be repeated
     #[arg(long, value_name = "CIDR")]
     pub(crate) scan: Vec<Range>,
     /// The ports to try at the addresses of --scan
