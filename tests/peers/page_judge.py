@@ -336,6 +336,7 @@ def main():
     for scenario, more in [("line-by-topics", ["--covers", "40", "--conveyor-off-at", "600"]), ("assembly-line", ["--covers", "12"])]:
         command = [arguments.binaries / "demo", "--scenario", scenario, *more]
         demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        recorder = None
         try:
             url, folder = page_of(demo)
             judge.out = arguments.out / scenario
@@ -354,9 +355,10 @@ def main():
                 judge.shoot("events-switched-off-light-wide")
             judge.console()
             judge.driver.get("about:blank")
-            recorder.send_signal(signal.SIGINT)
-            recorder.wait(20)
         finally:
+            if recorder:
+                recorder.send_signal(signal.SIGINT)
+                recorder.wait(20)
             demo.send_signal(signal.SIGINT)
             demo.communicate(timeout=60)
         if scenario == "line-by-topics":
