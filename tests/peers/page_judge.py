@@ -356,11 +356,12 @@ def main():
             judge.console()
             judge.driver.get("about:blank")
         finally:
+            demo.send_signal(signal.SIGINT)
             if recorder:
                 recorder.send_signal(signal.SIGINT)
-                recorder.wait(20)
-            demo.send_signal(signal.SIGINT)
             demo.communicate(timeout=60)
+            if recorder:
+                recorder.wait(20)
         if scenario == "line-by-topics":
             recorded(judge, arguments.binaries, recording)
     judge.out = arguments.out
