@@ -30,7 +30,10 @@ pub(crate) fn job(arguments: &JobArguments) -> Result<(), Failure> {
         JobVerb::List { json, at } => list(*json, at),
         JobVerb::Stop { number, at } => {
             change("DELETE", &format!("/jobs/{number}"), ("", Vec::new()), at)?;
-            say(&format!("job {number}: stopped"))
+            // The running skill may still move, and a job that has ended is not stopped.
+            say(&format!(
+                "job {number}: stop requested; `ua-space job list` shows its end"
+            ))
         }
     }
 }

@@ -36,8 +36,9 @@ pub(crate) enum JobVerb {
     },
     /// Stop a job
     ///
-    /// The running skill is halted; nothing is compensated. The components of a job with an unknown
-    /// outcome are given back, so that other jobs can use them: look at the machines first.
+    /// The running skill is halted; nothing is compensated. The command does not wait for the halt:
+    /// `ua-space job list` shows the end of the job. The components of a job with an unknown outcome
+    /// are given back, so that other jobs can use them: look at the machines first.
     Stop {
         /// The number of the job
         #[arg(value_name = "NUMBER")]
