@@ -97,6 +97,17 @@ struct Applied {
     tags: Vec<Tag>,
 }
 
+impl Applied {
+    /// Returns about its memory in bytes.
+    fn size(&self) -> usize {
+        let texts = self.tags.iter().flat_map(|tag| [&tag.name, &tag.value]);
+        let all = std::iter::once(&self.stereotype).chain(texts);
+        all.fold(0, |sum, text| {
+            sum.saturating_add(text.len()).saturating_add(50)
+        })
+    }
+}
+
 /// A value of a stereotype.
 #[derive(Clone, Debug)]
 struct Tag {

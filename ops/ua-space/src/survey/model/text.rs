@@ -500,6 +500,7 @@ impl Parser {
             ));
         }
         let mut applied: HashMap<usize, Vec<Applied>> = HashMap::new();
+        let mut copied: usize = 0;
         for metadata in std::mem::take(&mut self.metadata) {
             let mut targets: Vec<usize> = Vec::new();
             for path in &metadata.about {
@@ -516,6 +517,14 @@ impl Parser {
             }
             if metadata.about.is_empty() {
                 targets.extend(metadata.owner);
+            }
+            let copy = metadata.applied.size().saturating_mul(targets.len());
+            copied = copied.saturating_add(copy);
+            if copied > MOST_COPIED {
+                return Err(Finding::new(
+                    metadata.applied.line,
+                    "the values of the metadata are too large for all elements after `about`",
+                ));
             }
             for at in targets {
                 let all = applied.entry(at).or_default();
@@ -658,3 +667,5 @@ fn literal(tokens: &[Token]) -> Option<String> {
 
 /// Maximum number of tokens of a statement.
 const LONGEST: usize = 10_000;
+/// Maximum memory of all metadata, of which each annotated element has a copy, in bytes.
+const MOST_COPIED: usize = 1 << 30;
