@@ -193,6 +193,12 @@ impl Planner<'_> {
                 if let Some(at) = self.of_models.get(&node) {
                     // The server has the node of the model.
                     if let Some(entry) = self.plan.entries.get_mut(*at) {
+                        if entry.source.is_none() && from.is_some() && entry.origin != SpaceId::UA {
+                            // The mapping would command the machine of the server.
+                            let note = "guess: ROS writes the value into the node of the server";
+                            entry.notes.push(note.to_owned());
+                            entry.guessed = true;
+                        }
                         entry.source = entry.source.take().or(from);
                         entry.value = entry.value.or(one.value);
                     }
