@@ -283,7 +283,7 @@ impl<'a> Told<'a> {
         }
         let mut out = io::stdout().lock();
         if self.sums.is_empty() {
-            writeln!(out, "{}: nothing came by", self.topic)?;
+            writeln!(out, "{}: no sample was seen", self.topic)?;
         }
         let mut last = "";
         for ((program, kind), count) in &self.sums {

@@ -359,7 +359,7 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
         }
         table.without_empty_columns().write(&mut out, bold)?;
     } else if programs.is_empty() {
-        writeln!(out, "nothing that says its times was heard")?;
+        writeln!(out, "no message with its times was received")?;
     }
     Ok(())
 }
