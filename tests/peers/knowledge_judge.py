@@ -29,7 +29,7 @@ def plain(term):
 
 
 def main():
-    lifetime.bound(60.0)
+    lifetime.bound(180.0)
     # STR() returns a literal as it is written; rdflib would normalize it by default.
     rdflib.NORMALIZE_LITERALS = False
     known = rdflib.Dataset(default_union=True)

@@ -2,6 +2,7 @@
 //! have the same answers.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use knowledge::{
     Answer, ComponentFacts, Knowledge, NodeName, ParameterFacts, QUESTIONS, Question, SkillFacts,
@@ -251,7 +252,10 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
         });
     let files: Vec<_> = std::iter::once(quads).chain(texts).collect();
     let args: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
-    let told = cell.asyncua_once("knowledge_judge.py", &args);
+    let mut judge = cell.asyncua_started("knowledge_judge.py", &args).start();
+    let status = judge.wait_for_end(JUDGED);
+    assert!(status.success(), "the judge ended with {status}: {judge}");
+    let told = judge.json_lines();
     assert_eq!(told.len(), asked.len());
     let mut empty = Vec::new();
     for ((question, parameters), told) in asked.iter().zip(told) {
@@ -286,3 +290,6 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
     ];
     assert_eq!(empty, expected);
 }
+
+/// Time limit of rdflib for all queries. It takes about 6 s of processor time.
+const JUDGED: Duration = Duration::from_secs(180);
