@@ -242,6 +242,14 @@ fn failed(message: &str) -> Outcome {
     }
 }
 
+/// Returns an outcome whose end is unknown.
+fn unconfirmed(message: &str) -> Outcome {
+    Outcome {
+        unknown: true,
+        ..failed(message)
+    }
+}
+
 fn offer(component: &str, name: &str, of: &str) -> Offer {
     Offer {
         is_skill: true,
@@ -532,10 +540,7 @@ async fn a_run_whose_end_is_unknown_has_no_end_and_is_repeated_by_nobody() {
         Err(SkillFault::Unexpected("its outcome is of run 7".into())),
         Err(refused.clone()),
         // The flag counts, and not the words of the message.
-        Ok(Outcome {
-            unknown: true,
-            ..failed("halted, and nothing was received after that")
-        }),
+        Ok(unconfirmed("halted, and nothing was received after that")),
     ];
     for process in [grasps(), process()] {
         for end in &ends {
@@ -849,7 +854,7 @@ async fn completed_steps_are_compensated_in_reverse_order() {
 async fn a_compensation_with_an_unknown_outcome_stops_the_others() {
     let ends = [
         (
-            Ok(failed("halted; the outcome is unknown: no answer")),
+            Ok(unconfirmed("halted; the outcome is unknown: no answer")),
             How::Unknown,
         ),
         (Ok(failed("it is jammed")), How::Failed),
@@ -877,7 +882,7 @@ async fn a_compensation_with_an_unknown_outcome_stops_the_others() {
 
 #[tokio::test]
 async fn nothing_is_compensated_while_a_skill_may_go_on_or_after_a_stop() {
-    let unknown = Ok(failed("halted; the outcome is unknown: no answer"));
+    let unknown = Ok(unconfirmed("halted; the outcome is unknown: no answer"));
     let lost = Err(SkillFault::Lost("the connection broke".into()));
     for end in [unknown, lost] {
         let mut fakes = drilling(&["drill", "other"]);
