@@ -28,7 +28,7 @@ use crate::lanes::Lane;
 use crate::query::{Asked, Dataset, Formats, Limits, Queries, QueryFault, Results};
 use crate::question::{QUESTIONS, Question, QuestionFault};
 use crate::store::Knowledge;
-use crate::writes::{UPDATE, Writes, media, updated};
+use crate::writes::{UPDATE, Writes, failed, media, updated};
 
 /// Additional pages by their path: JSON, or `None` for an unknown page.
 pub type Page = Arc<dyn Fn(&str) -> Option<String> + Send + Sync>;
@@ -191,7 +191,7 @@ impl Site {
             }
             path => match path.strip_prefix("/ask/") {
                 Some(name) => self.question(name, pairs, accepted(&request)).await,
-                None => match (self.page)(path) {
+                None => match self.made_page(path).await? {
                     Some(page) => Ok(content(JSON, page.into_bytes())),
                     None => Err(Refusal::unknown(
                         "there are /sparql, /update, /store, /sources, /jobs, /ask, /ask/NAME, /graphs, /data, /report and /status here"
@@ -200,6 +200,13 @@ impl Site {
                 },
             },
         }
+    }
+
+    /// Returns an additional page. It may plan a process, which takes long.
+    async fn made_page(&self, path: &str) -> Result<Option<String>, Refusal> {
+        let (page, path) = (Arc::clone(&self.page), path.to_owned());
+        let made = tokio::task::spawn_blocking(move || page(&path)).await;
+        made.map_err(|error| failed(&error))
     }
 
     async fn sparql(

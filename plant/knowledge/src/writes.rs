@@ -120,7 +120,12 @@ impl Site {
                 let process = process.ok_or_else(|| {
                     Refusal::malformed("a job is JSON: {\"process\": \"IRI of the process\"}")
                 })?;
-                let started = writes.jobs.start(process).map_err(Refusal::unknown)?;
+                let (jobs, process) = (Arc::clone(&writes.jobs), process.to_owned());
+                // The sequence of a goal is searched, which takes long.
+                let started = tokio::task::spawn_blocking(move || jobs.start(&process)).await;
+                let started = started
+                    .map_err(|error| failed(&error))?
+                    .map_err(Refusal::unknown)?;
                 let job = started.ok_or_else(|| {
                     let why = "too many jobs are running; start it when one of them has ended";
                     Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "busy", why)
@@ -383,7 +388,7 @@ fn status(status: StatusCode) -> Response<Full<Bytes>> {
     response
 }
 
-fn failed(error: &dyn fmt::Display) -> Refusal {
+pub(crate) fn failed(error: &dyn fmt::Display) -> Refusal {
     let status = StatusCode::INTERNAL_SERVER_ERROR;
     Refusal::new(status, "failed", &error.to_string())
 }
