@@ -38,6 +38,8 @@ pub(crate) struct Cell {
     runs: Runs,
     /// The runs that use components, by the IRIs of the components.
     leases: Mutex<BTreeMap<String, String>>,
+    /// Held during the search for a sequence, which takes up to 100 MB of memory.
+    searching: Mutex<()>,
     next_run: AtomicU64,
 }
 
@@ -107,6 +109,7 @@ impl Cell {
             changed: watch::channel(0).0,
             runs: Runs::default(),
             leases: Mutex::default(),
+            searching: Mutex::default(),
             next_run: AtomicU64::new(1),
         }
     }
@@ -131,6 +134,19 @@ impl Cell {
     /// Gives back the components of a run.
     pub(crate) fn give_back(&self, run: &str) {
         self.lease(run, &BTreeSet::new());
+    }
+
+    /// Gives back the components of the run with this number.
+    pub(crate) fn give_back_of(&self, number: u64) {
+        let end = format!("-{number}");
+        let holder = self
+            .leases()
+            .values()
+            .find(|run| run.ends_with(&end))
+            .cloned();
+        if let Some(run) = holder {
+            self.give_back(&run);
+        }
     }
 
     pub(crate) fn knowledge(&self) -> &Knowledge {
@@ -195,7 +211,11 @@ impl Cell {
             let mut skills = offers.iter().filter(|offer| offer.is_skill);
             skills.any(|offer| offer.closure.contains(&action.capability))
         });
-        let sequence = goal.search(&actions).map_err(|why| {
+        let searching = self.searching.lock();
+        let searching = searching.unwrap_or_else(PoisonError::into_inner);
+        let sequence = goal.search(&actions);
+        drop(searching);
+        let sequence = sequence.map_err(|why| {
             let without: Vec<_> = without.iter().map(|action| action.name.as_str()).collect();
             Some(match without.as_slice() {
                 [] => why,

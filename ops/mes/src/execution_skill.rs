@@ -13,8 +13,9 @@ use crate::record::How;
 /// Plans and runs the process of its parameter.
 pub(crate) struct ExecuteProcess {
     pub(crate) cell: Arc<Cell>,
-    /// The last run with an unknown outcome. The skill was reset after it.
-    unknown: Mutex<Option<String>>,
+    /// The number of the last run, unless its end is known. A run that was given up has not
+    /// returned its outcome. The skill needs a Reset after such a run.
+    unknown: Mutex<Option<u64>>,
 }
 
 impl ExecuteProcess {
@@ -25,7 +26,7 @@ impl ExecuteProcess {
         }
     }
 
-    fn unknown(&self) -> MutexGuard<'_, Option<String>> {
+    fn unknown(&self) -> MutexGuard<'_, Option<u64>> {
         self.unknown.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -79,13 +80,13 @@ impl Driver for ExecuteProcess {
         let plant: Arc<dyn Plant> = Arc::clone(&self.cell) as Arc<dyn Plant>;
         let number = self.cell.next_run();
         // The Reset that the skill needed confirms that the machines of the last run stand still.
-        let last = self.unknown().take();
+        let last = self.unknown().replace(number);
         if let Some(last) = last {
-            self.cell.give_back(&last);
+            self.cell.give_back_of(last);
         }
         let run = execute(&plant, &process, number, &Telling(&work)).await;
-        if run.outcome == How::Unknown {
-            *self.unknown() = Some(run.run.clone());
+        if run.outcome != How::Unknown {
+            *self.unknown() = None;
         }
         match (run.outcome, run.reason) {
             (How::Done, _) => report(

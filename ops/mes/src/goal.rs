@@ -10,7 +10,7 @@ use knowledge::{Answer, Knowledge};
 use serde::Serialize;
 
 use crate::process::{By, Given, Job, Need, Process, Role, Step};
-use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN, parameters_of, seconds};
+use crate::read_process::{MOST_STEPS, USUALLY_WAIT, USUALLY_WITHIN, parameters_of, seconds};
 
 /// An action.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -130,6 +130,11 @@ impl Goal {
         }
         let start = facts.known(&self.given);
         match found(start, goal, &steps)? {
+            Some(order) if order.len() > MOST_STEPS => Err(format!(
+                "its shortest sequence has {} steps, and a process has at most {MOST_STEPS}; \
+                 split it into several goals",
+                order.len()
+            )),
             Some(order) => Ok(self.proved(actions, &order)),
             None => Err(self.unreachable(actions)),
         }
