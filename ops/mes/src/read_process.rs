@@ -371,7 +371,7 @@ pub(crate) fn seconds(value: Option<&Value>, name: &str) -> Result<Option<Durati
 
 pub(crate) const USUALLY_WITHIN: Duration = Duration::from_secs(30);
 pub(crate) const USUALLY_WAIT: Duration = Duration::from_secs(60);
-const USUALLY_APPROACH: f64 = 0.05;
+pub(crate) const USUALLY_APPROACH: f64 = 0.05;
 /// Maximum number of steps of a process.
 pub(crate) const MOST_STEPS: usize = 100;
 /// Longest time of a process in seconds.

@@ -4,7 +4,6 @@ mod files;
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use knowledge::is_iri;
 use plant_opcua::client::ClientUser;
@@ -12,6 +11,7 @@ use skills::yaml::{Code, Findings, Kind, Node, Reader, parse};
 use skills::{Lds, Security, TypeName};
 
 use crate::process::{By, Given, Job, Need, Process, ResultOf, Role, Step};
+use crate::read_process::{MOST_STEPS, USUALLY_APPROACH, USUALLY_WAIT, USUALLY_WITHIN};
 
 pub(crate) use files::{Connect, Manifest, RmlSource, Source};
 
@@ -695,10 +695,6 @@ fn shortened(text: &str) -> String {
 const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
 const DEFAULT_SPARQL: SocketAddr =
     SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 8087);
-const USUALLY_WITHIN: Duration = Duration::from_secs(30);
-const USUALLY_WAIT: Duration = Duration::from_secs(60);
-const USUALLY_APPROACH: f64 = 0.05;
-const MOST_STEPS: usize = 100;
 
 #[cfg(test)]
 mod tests;
