@@ -1,7 +1,8 @@
 //! Goals: a sequence of actions is searched that leads from the given facts to the wanted facts.
 //!
-//! An action is a capability with its conditions before and after (STRIPS with negative conditions).
-//! The sequence that is found is one of the shortest, and it is a process like any other.
+//! An action is a capability with its conditions before and after (STRIPS with negative
+//! conditions). The sequence that is found is one of the shortest, and it is a process like any
+//! other.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::time::Duration;
