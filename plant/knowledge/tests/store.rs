@@ -185,6 +185,10 @@ fn a_quantity_is_held_by_skills_whose_limits_contain_it_in_any_unit() {
     let found = ask(&knowledge, "what-can-hold", &[("quantity", "3 kg")]);
     assert_eq!(found.rows[0]["source"], sheet.graph());
     assert_eq!(ask(&knowledge, "what-can-hold", &[]).rows.len(), 2);
+    // A limit that is no number holds nothing.
+    let text = turtle.replace("5000", "\"5000\"");
+    knowledge.replace_turtle(&sheet, &text, 1).unwrap();
+    assert_eq!(held("3 kg", GRASP), []);
 }
 
 #[test]
