@@ -349,7 +349,7 @@ fn a_process_that_is_added_as_rdf_runs_with_one_gripper_and_outlasts_a_kill() {
 /// Processes that take the pose of an object, and undo the grasp when the last move fails.
 const COMPENSATED: &str = r"processes:
   - process: urn:fetch
-    wait: 30 s
+    wait: 90 s
     steps:
       - {step: locate, needs: {skill: {type: LocateObjectSkillType}}, parameters: {ObjectId: box}}
       - step: move
@@ -429,8 +429,8 @@ fn a_failed_job_undoes_its_steps_and_jobs_share_a_gripper() {
         ["let go", "done", true],
     ]);
     assert_eq!(Value::from(ran), expected);
-    let (known, told) = space(&["job", "start", "urn:nothing"]);
-    assert!(!known && told.contains("is no process here"), "{told}");
+    let (is_known, told) = space(&["job", "start", "urn:nothing"]);
+    assert!(!is_known && told.contains("is no process here"), "{told}");
     drop(mes);
 
     let _mes = compensating(&cell, "0.5");
@@ -438,7 +438,7 @@ fn a_failed_job_undoes_its_steps_and_jobs_share_a_gripper() {
         let (started, told) = space(&["job", "start", process]);
         assert!(started, "{told}");
     }
-    let ended = eventually("all jobs have ended", SOON, || {
+    let ended = eventually("all jobs have ended", SOON * 3, || {
         let listed = get("/jobs")?;
         let all = list(&listed, "jobs").to_vec();
         let have_ended = all.iter().all(|job| job["outcome"] != "running");
