@@ -84,6 +84,15 @@ impl Watched {
         self.ends(How::Unknown, Some(why.to_owned()), Values::new());
     }
 
+    /// Records the loss of the component. The end of a run that was halted before is unknown: the
+    /// Halt is not confirmed.
+    fn went(&self, why: &str) {
+        if self.is_halted.load(Ordering::Relaxed) {
+            self.unknown(why);
+        }
+        self.fell(true, why);
+    }
+
     fn fell(&self, is_lost: bool, why: &str) {
         let skill = (!is_lost).then(|| self.offer.skill.clone());
         let why = if is_lost {
@@ -131,7 +140,7 @@ impl Runs for Watched {
                 self.fell(false, &outcome.message);
                 self.ends(How::Failed, Some(outcome.message.clone()), Values::new());
             }
-            Err(SkillFault::Lost(why)) => self.fell(true, why),
+            Err(SkillFault::Lost(why)) => self.went(why),
             Err(fault) if may_go_on(fault, began.elapsed() >= within) => {
                 self.unknown(&fault.to_string());
             }
@@ -150,7 +159,7 @@ impl Runs for Watched {
 
     async fn lost(&self) -> String {
         let why = self.inner.lost().await;
-        self.fell(true, &why);
+        self.went(&why);
         why
     }
 }
