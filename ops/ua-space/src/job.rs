@@ -94,8 +94,8 @@ impl Job {
         match self.outcome.as_str() {
             "running" => None,
             "done" => Some(Ok(())),
-            "unknown" => Some(Err(Failure::Unavailable(self.line()))),
-            _ => Some(Err(Failure::Failed(self.line()))),
+            "unknown" => Some(Err(Failure::Unavailable(harmless(&self.line())))),
+            _ => Some(Err(Failure::Failed(harmless(&self.line())))),
         }
     }
 }
