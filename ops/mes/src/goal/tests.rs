@@ -88,6 +88,28 @@ fn twenty_problems_have_plans_as_long_as_those_of_another_planner() {
     }
 }
 
+#[test]
+fn a_sequence_has_at_most_as_many_steps_as_a_process() {
+    let chain = |length: usize| {
+        let action = |number: usize| Action {
+            iri: format!("urn:action:{number}"),
+            requires: [format!("fact {number}")].into(),
+            adds: [format!("fact {}", number + 1)].into(),
+            ..Action::default()
+        };
+        let actions: Vec<Action> = (0..length).map(action).collect();
+        let goal = Goal {
+            given: ["fact 0".to_owned()].into(),
+            wants: [format!("fact {length}")].into(),
+            ..Goal::default()
+        };
+        goal.search(&actions).map(|sequence| sequence.steps.len())
+    };
+    assert_eq!(chain(MOST_STEPS), Ok(MOST_STEPS));
+    let refused = chain(MOST_STEPS + 1).unwrap_err();
+    assert!(refused.contains("has 101 steps"), "{refused}");
+}
+
 const TURTLE: &str = r#"@prefix ua: <urn:ua-bridge:plant#> . @prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> .
 @prefix cask: <http://www.w3id.org/hsu-aut/cask#> . @prefix : <urn:f:> .
 <urn:grasp> a ua:Action ; rdfs:label "grasp" ; ua:ofCapability <urn:c:grasp> ;
