@@ -151,11 +151,7 @@ impl ServerPort {
         let certificates = Configuration::new(setup.pki.root(), &described.application_uri);
         let mdns = matches!(&setup.announce, Some(to) if to.mdns.is_some());
         let shown = (&setup.sks, &pubsub, &alarms);
-        let facets = Facets {
-            is_secured: security.iter().any(|policy| *policy != Security::None),
-            has_history: layout.topics.iter().any(|topic| topic.historizing),
-            has_alarms: true,
-        };
+        let facets = facets(&security, &layout);
         let core = core(shown, (&certificates, mdns), (described, facets), &access);
         let builder = endpoint::server(described, (&setup.url, port), &security);
         let (trusts_any, limits) = (setup.trust_any_client, endpoint::clients(described.limits));
@@ -168,9 +164,8 @@ impl ServerPort {
             .build()
             .map_err(configuration)?;
         let manager = manager(&handle, &layout).map_err(configuration)?;
-        let history = history(described, &layout)?;
-        let shown = (&*pubsub, &*alarms);
-        show_limits(mapping, &layout, (&handle, &manager), (shown, history));
+        let shown = ((&*pubsub, &*alarms), history(described, &layout)?);
+        show_limits(mapping, &layout, (&handle, &manager), shown);
         let (runtime, listener) = endpoint::threads(listener)?;
         let serving = runtime.spawn(server.run_with(listener));
         endpoint::stand(&runtime, door)?;
@@ -687,7 +682,7 @@ fn show_limits(
     mapping: &Arc<Mapping>,
     layout: &Arc<Layout>,
     (handle, manager): (&ServerHandle, &Arc<SpaceManager>),
-    ((pubsub, alarms), history): ((&PubSub, &Alarms), Option<(Store, Vec<Stored>)>),
+    ((pubsub, alarms), history): ((&PubSub, &Alarms), Option<OpenedHistory>),
 ) {
     limit(manager.inner(), mapping);
     let conditions = history.map(|(mut store, values)| {
@@ -701,8 +696,20 @@ fn show_limits(
     alarms.stand(Arc::clone(manager), handle, mapping, conditions);
 }
 
+/// The file of the history, and its values.
+type OpenedHistory = (Store, Vec<Stored>);
+
+/// Returns the facets of the profile that a server with these policies and topics has.
+fn facets(security: &[Security], layout: &Layout) -> Facets {
+    Facets {
+        is_secured: security.iter().any(|policy| *policy != Security::None),
+        has_history: layout.topics.iter().any(|topic| topic.historizing),
+        has_alarms: true,
+    }
+}
+
 /// Opens the file of the history, if the mapping names a file.
-fn history(described: &Server, layout: &Layout) -> Result<Option<(Store, Vec<Stored>)>, Failure> {
+fn history(described: &Server, layout: &Layout) -> Result<Option<OpenedHistory>, Failure> {
     let file = described.history_file.as_ref();
     let opened = file.map(|file| Store::open(file, layout.topics.iter()));
     let opened = opened.transpose();

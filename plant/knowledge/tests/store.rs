@@ -163,7 +163,7 @@ fn a_quantity_is_held_by_skills_whose_limits_contain_it_in_any_unit() {
         found.rows.iter().map(limit).collect::<Vec<_>>()
     };
     let force = ("Force".to_owned(), Some(50.0));
-    assert_eq!(held("0.05 kN", ""), [force.clone()]);
+    assert_eq!(held("0.05 kN", ""), std::slice::from_ref(&force));
     assert_eq!(held("50 N", GRASP), [force]);
     for (quantity, capability) in [
         ("86 N", ""),

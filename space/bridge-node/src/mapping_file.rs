@@ -369,12 +369,17 @@ impl MappingFile {
     /// does not, such as a remounted folder of a container and files on a network. It costs a
     /// handful of system calls, and it is needed anyway to wait until a file is written completely.
     /// There may be thousands of definitions, so each poll checks a bounded number of them in turn.
-    pub(crate) async fn follow(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
-        if let Some(configuration) = self.configuration.clone() {
-            return self
-                .follow_configuration(configuration, hangup, shells)
-                .await;
+    pub(crate) async fn follow(self, hangup: Signal, shells: watch::Sender<Running>) {
+        match self.configuration.clone() {
+            Some(configuration) => {
+                self.follow_configuration(configuration, hangup, shells)
+                    .await;
+            }
+            None => self.follow_mapping(hangup, shells).await,
         }
+    }
+
+    async fn follow_mapping(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
         let mut pause = Duration::ZERO;
         let mut before = Before::default();
         let mut turn = 0_usize;

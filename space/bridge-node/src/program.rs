@@ -307,14 +307,7 @@ async fn prepare<P: Program>(
         types,
         about,
     } = changes.borrow().clone();
-    info!(
-        version = build_info::version(),
-        space = %own,
-        mapping = arguments.mapping.as_ref().map(|file| tracing::field::display(file.display())),
-        hash = about.hash(),
-        "{} starts",
-        P::NAME
-    );
+    log_start::<P>(arguments, own, about.hash());
     let (carrier, group) = carrier::open((P::NAME, own), (arguments, &mapping), several)?;
     let settings = Settings {
         own,
@@ -381,6 +374,17 @@ async fn prepare<P: Program>(
         observer,
         _told: told,
     })
+}
+
+fn log_start<P: Program>(arguments: &Arguments, own: SpaceId, hash: &str) {
+    info!(
+        version = build_info::version(),
+        space = %own,
+        mapping = arguments.mapping.as_ref().map(|file| tracing::field::display(file.display())),
+        hash,
+        "{} starts",
+        P::NAME
+    );
 }
 
 /// Sets the instance of a program, and its rank among the redundant bridges of its space.

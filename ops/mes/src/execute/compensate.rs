@@ -65,6 +65,15 @@ pub(super) fn resolved(
     step.parameters.iter().map(one).collect()
 }
 
+/// A completed step, its compensation, and the skill that runs the compensation.
+type Undone<'a> = (&'a Step, &'a Step, &'a Offer);
+
+/// Returns the names of the completed steps.
+fn names(steps: &[Undone<'_>]) -> String {
+    let names = steps.iter().map(|(step, ..)| format!("`{}`", step.name));
+    names.collect::<Vec<_>>().join(", ")
+}
+
 impl Execution<'_> {
     /// Compensates the completed steps of a run that failed, and adds what was done to the reason.
     ///
@@ -76,14 +85,10 @@ impl Execution<'_> {
             let compensation = step.compensation.as_deref()?;
             Some((step, compensation, done.undo.as_ref()?))
         });
-        let undone: Vec<(&Step, &Step, &Offer)> = undone.collect();
+        let undone: Vec<Undone<'_>> = undone.collect();
         if undone.is_empty() {
             return why;
         }
-        let names = |steps: &[(&Step, &Step, &Offer)]| {
-            let names = steps.iter().map(|(step, ..)| format!("`{}`", step.name));
-            names.collect::<Vec<_>>().join(", ")
-        };
         let not = match (self.is_stopped().await, is_open(&self.log.run())) {
             (true, _) => Some("it was stopped"),
             (_, true) => Some("the end of a skill is not confirmed"),
@@ -104,26 +109,43 @@ impl Execution<'_> {
                 ..Planned::begins(number, now, plan)
             });
         });
-        for (position, (step, compensation, offer)) in undone.iter().enumerate() {
-            let Err(fault) = self.undo(compensation, offer, done).await else {
-                info!(step = step.name, "a step is compensated");
-                continue;
-            };
-            warn!(
-                step = step.name,
-                "the compensation of a step failed: {fault}"
-            );
-            let reason = format!("the compensation of `{}` failed: {fault}", step.name);
-            self.end(How::Failed, Some(reason.clone()));
-            let left = undone.get(position.saturating_add(1)..).unwrap_or_default();
-            let left = match left {
-                [] => String::new(),
-                left => format!("; not compensated: {}", names(left)),
-            };
-            return format!("{why}; {reason}{left}");
+        match self.undo_all(&undone, done).await {
+            Ok(()) => {
+                self.end(How::Done, None);
+                format!("{why}; compensated: {}", names(&undone))
+            }
+            Err((reason, left)) => {
+                self.end(How::Failed, Some(reason.clone()));
+                let left = match left {
+                    [] => String::new(),
+                    left => format!("; not compensated: {}", names(left)),
+                };
+                format!("{why}; {reason}{left}")
+            }
         }
-        self.end(How::Done, None);
-        format!("{why}; compensated: {}", names(&undone))
+    }
+
+    /// Runs the compensations in order up to the first that fails. Returns its reason, and the
+    /// steps after it.
+    async fn undo_all<'a>(
+        &self,
+        undone: &'a [Undone<'a>],
+        done: &[Done],
+    ) -> Result<(), (String, &'a [Undone<'a>])> {
+        let mut left = undone;
+        while let [(step, compensation, offer), rest @ ..] = left {
+            left = rest;
+            if let Err(fault) = self.undo(compensation, offer, done).await {
+                warn!(
+                    step = step.name,
+                    "the compensation of a step failed: {fault}"
+                );
+                let reason = format!("the compensation of `{}` failed: {fault}", step.name);
+                return Err((reason, left));
+            }
+            info!(step = step.name, "a step is compensated");
+        }
+        Ok(())
     }
 
     /// Runs the skill of a compensation.

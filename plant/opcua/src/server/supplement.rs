@@ -42,7 +42,13 @@ impl NodeFacts {
     pub fn of(node: &NodeType) -> Self {
         let access_level = match node {
             NodeType::Variable(variable) => Some(variable.access_level().bits()),
-            _ => None,
+            NodeType::Object(_)
+            | NodeType::ObjectType(_)
+            | NodeType::ReferenceType(_)
+            | NodeType::VariableType(_)
+            | NodeType::View(_)
+            | NodeType::DataType(_)
+            | NodeType::Method(_) => None,
         };
         Self {
             class: node.node_class(),
@@ -221,7 +227,29 @@ impl Supplement {
                 let roles = access.roles(&context.token);
                 Some(listed(access.permissions(node), roles, facts.class))
             }
-            _ => None,
+            AttributeId::NodeId
+            | AttributeId::NodeClass
+            | AttributeId::BrowseName
+            | AttributeId::DisplayName
+            | AttributeId::Description
+            | AttributeId::WriteMask
+            | AttributeId::UserWriteMask
+            | AttributeId::IsAbstract
+            | AttributeId::Symmetric
+            | AttributeId::InverseName
+            | AttributeId::ContainsNoLoops
+            | AttributeId::EventNotifier
+            | AttributeId::Value
+            | AttributeId::DataType
+            | AttributeId::ValueRank
+            | AttributeId::ArrayDimensions
+            | AttributeId::AccessLevel
+            | AttributeId::UserAccessLevel
+            | AttributeId::MinimumSamplingInterval
+            | AttributeId::Historizing
+            | AttributeId::Executable
+            | AttributeId::UserExecutable
+            | AttributeId::DataTypeDefinition => None,
         }
     }
 }
@@ -254,7 +282,11 @@ fn bits(permissions: Permissions, role: Role, class: NodeClass) -> PermissionTyp
         NodeClass::Object | NodeClass::View => {
             (PermissionType::ReceiveEvents, PermissionType::empty())
         }
-        _ => (PermissionType::empty(), PermissionType::empty()),
+        NodeClass::Unspecified
+        | NodeClass::Method
+        | NodeClass::ObjectType
+        | NodeClass::ReferenceType
+        | NodeClass::DataType => (PermissionType::empty(), PermissionType::empty()),
     };
     if permissions.read.contains(role) {
         bits |= read;
