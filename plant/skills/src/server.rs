@@ -525,7 +525,9 @@ impl Leases {
     /// session wrote are discarded.
     async fn free(self, idle: Duration) {
         let (closed, mut told) = mpsc::channel(MOST_CLOSED);
+        let authority = self.authority.clone();
         self.server.on_session_closed(move |session| {
+            authority.release(&Owner::Session(session));
             // The queue is longer than the maximum number of sessions of the server.
             if let Err(error) = closed.try_send(session) {
                 tracing::warn!(session, "cannot process the end of a session: {error}");
@@ -536,11 +538,7 @@ impl Leases {
         loop {
             tokio::select! {
                 session = told.recv() => match session {
-                    Some(session) => {
-                        let owner = Owner::Session(session);
-                        self.authority.release(&owner);
-                        self.forget(&owner);
-                    }
+                    Some(session) => self.forget(&Owner::Session(session)),
                     None => return,
                 },
                 _ = look.tick() => if let Some(owner) = self.authority.release_idle(idle, Instant::now()) {

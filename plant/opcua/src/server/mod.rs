@@ -348,7 +348,7 @@ impl Server {
     }
 
     /// Registers a callback for the end of sessions that called or wrote something, by closing or
-    /// by timeout. A task of the server runs the callback and waits for it.
+    /// by timeout. It runs before the next call or write is answered, and must not block.
     pub fn on_session_closed(&self, told: impl Fn(u32) + Send + Sync + 'static) {
         self.inner.calls.sessions.tell(Arc::new(told));
     }

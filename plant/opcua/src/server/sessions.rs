@@ -92,8 +92,11 @@ pub(crate) struct Sessions {
 }
 
 impl Sessions {
-    /// Returns the client and user of a request, and starts to supervise the session.
+    /// Returns the client and user of a request, and starts to supervise the session. What ended
+    /// sessions held is released first, so that a client that closes its session and opens the next
+    /// one is not refused because of itself.
     pub(crate) fn caller(&self, context: &RequestContext) -> Caller {
+        self.look();
         let mut watched = self.watched.lock();
         watched.entry(context.session_id).or_insert_with(|| {
             self.added.notify_one();
@@ -150,6 +153,8 @@ const LOOK: Duration = Duration::from_millis(50);
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicBool, Ordering};
+
     use super::*;
 
     #[tokio::test]
@@ -160,5 +165,23 @@ mod tests {
         let presence = Presence::while_(|| true);
         sessions.watched.lock().insert(1, presence);
         assert_eq!(sessions.wait(longest).await, LOOK);
+    }
+
+    #[test]
+    fn the_end_of_a_session_is_reported_once() {
+        let sessions = Sessions::default();
+        let ended = Arc::new(Mutex::new(Vec::new()));
+        let told = Arc::clone(&ended);
+        sessions.tell(Arc::new(move |session| told.lock().push(session)));
+        let lasts = Arc::new(AtomicBool::new(true));
+        let present = Arc::clone(&lasts);
+        let presence = Presence::while_(move || present.load(Ordering::Relaxed));
+        sessions.watched.lock().insert(7, presence);
+        sessions.look();
+        assert!(ended.lock().is_empty());
+        lasts.store(false, Ordering::Relaxed);
+        sessions.look();
+        sessions.look();
+        assert_eq!(*ended.lock(), [7]);
     }
 }
