@@ -369,3 +369,22 @@ fn no_room_is_taken_for_the_chunks_of_a_stranger_where_no_call_is_open() {
         assert_eq!(cell.dropped(GRIPPER, Reason::Incomplete), 0);
     }
 }
+
+#[test]
+fn a_stranger_that_sends_half_a_request_takes_room_only_where_a_call_is_open() {
+    for open in [false, true] {
+        let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+        cell.offer(GRIPPER, start(), offered(open));
+        cell.run(ms(200));
+        cell.programs[BRIDGE].address = SocketAddr::from(([192, 0, 2, 9], 5_000));
+        cell.copies = Box::new(|bytes| {
+            let chunk = NetworkMessage::decode(bytes).and_then(|message| message.chunk());
+            usize::from(!chunk.is_ok_and(|chunk| chunk.offset > 0))
+        });
+        cell.ask(BRIDGE, AskId(1), (start(), &large(25_000)), ms(3_000));
+        cell.run(ms(10_000));
+        assert!(cell.executions(GRIPPER).is_empty());
+        let incomplete = cell.dropped(GRIPPER, Reason::Incomplete);
+        assert_eq!(incomplete > 0, open, "{incomplete} incomplete");
+    }
+}

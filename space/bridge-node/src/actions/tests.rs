@@ -488,6 +488,16 @@ impl Space {
         heard
     }
 
+    /// Runs both bridges for a number of passes.
+    async fn passes(&mut self, count: usize) {
+        let passed = async {
+            for _ in 0..count {
+                tokio::task::yield_now().await;
+            }
+        };
+        self.until(passed).await;
+    }
+
     async fn cancelled(&mut self) -> Cancel {
         let mut cancels = std::mem::replace(&mut self.cancels, mpsc::channel(1).1);
         let cancel = self.until(cancels.recv()).await.unwrap();
@@ -725,6 +735,8 @@ async fn of_two_cancellations_of_one_moment_a_server_hears_one() {
     let first = space.cancel().await;
     let cancel = space.cancelled().await;
     let second = space.cancel().await;
+    space.passes(200).await;
+    assert!(space.cancels.try_recv().is_err(), "the server hears one");
     let goals = vec![ID];
     cancel.answer.send(Ok(CancelAnswer { code: 0, goals })).ok();
     assert!(space.until(first).await.unwrap());
