@@ -455,3 +455,19 @@ fn a_redundant_bridge_refuses_a_mapping_with_calls() {
         "{said}"
     );
 }
+
+#[test]
+fn a_bridge_without_a_rank_goes_on_after_a_request_to_switch_over() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let mapping = cell.file("plain.yaml", "spaces: [{id: 1}]\n");
+    let mut bridge = Started::new("bridge-ros1", &program("bridge-ros1"))
+        .args([&mapping])
+        .start();
+    bridge.wait_for_line("bridge-ros1 starts", SOON);
+    bridge.signal(Signal::SIGUSR1);
+    bridge.wait_for_line("ignored SIGUSR1", SOON);
+    bridge.signal(Signal::SIGTERM);
+    assert_eq!(bridge.wait_for_end(SOON).code(), Some(0));
+}

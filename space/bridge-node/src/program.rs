@@ -245,11 +245,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         let signal = signals::stopped()?;
         let hangup = signals::listen(SignalKind::hangup())?;
         let (switch, switches) = watch::channel(0);
-        let switching = signals::count(
-            program.rank().is_some(),
-            SignalKind::user_defined1(),
-            switch,
-        )?;
+        let switching = signals::switches(program.rank().is_some(), switch)?;
         let (changed, changes) = watch::channel(running);
         service_manager::start_watchdog();
         let taps = Arc::<Taps>::default();

@@ -2,6 +2,7 @@
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
+use tracing::warn;
 
 use crate::exit::{Failure, FailureKind};
 
@@ -19,18 +20,19 @@ pub(crate) fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Fai
     })
 }
 
-/// Counts a signal and reports the count. Never completes. The signal keeps its default action if
-/// the program does not listen.
-pub(crate) fn count(
-    listens: bool,
-    kind: SignalKind,
+/// Counts the requests to switch over (SIGUSR1) and reports the count. Never completes. A program
+/// without a rank ignores the signal, whose default action would end it.
+pub(crate) fn switches(
+    is_ranked: bool,
     counted: watch::Sender<u64>,
 ) -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
-    let stream = listens.then(|| listen(kind)).transpose()?;
+    let mut stream = listen(SignalKind::user_defined1())?;
     Ok(async move {
-        if let Some(mut stream) = stream {
-            while stream.recv().await.is_some() {
+        while stream.recv().await.is_some() {
+            if is_ranked {
                 counted.send_modify(|count| *count += 1);
+            } else {
+                warn!("ignored SIGUSR1: this program runs without --rank");
             }
         }
         std::future::pending().await
