@@ -80,6 +80,12 @@ pub trait Carrier: fmt::Debug + Send {
         Vec::new()
     }
 
+    /// Returns the number of messages since the last call that the program did not receive in time,
+    /// as far as the carrier stores them itself.
+    fn overflowed(&mut self) -> u64 {
+        0
+    }
+
     /// Starts to close the carrier: withdraws everything that the network stores.
     fn close(&mut self) {}
 

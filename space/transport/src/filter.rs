@@ -1,9 +1,10 @@
-//! The kernel's filter for own datagrams.
+//! The kernel's filter for datagrams of this process.
 //!
 //! The kernel delivers each multicast datagram to all members of the group, including its sender.
-//! A filter of classic BPF on the receiving socket drops own datagrams before they wake the
-//! program. It only saves work: the caller's loop rule does not depend on it, and applies to
-//! everything that the filter does not match, such as a forged datagram from another address.
+//! A filter of classic BPF on the receiving socket drops own datagrams, and those of the other
+//! programs of the process, before they wake the program. It only saves work: the caller's loop
+//! rule does not depend on it, and applies to everything that the filter does not match, such as a
+//! forged datagram from another address.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -14,42 +15,61 @@ use tracing::debug;
 
 use crate::interface::Interface;
 
-/// The filter of a receiving socket for the datagrams of a sending socket.
+/// The filter of a receiving socket for the datagrams of the sending sockets of the process.
 #[derive(Debug, Default)]
 pub(crate) struct OwnFilter {
-    set: Option<Sources>,
+    set: Option<Vec<OwnSource>>,
+    /// The sources of the other programs of the process.
+    companions: Vec<OwnSource>,
     /// True if the kernel has refused a filter, which is logged once.
     refused: bool,
 }
 
-/// The source addresses of own datagrams. A sender that is bound to no address uses the address of
-/// the interface through which a datagram leaves. A datagram of another host with the same port is
-/// not matched.
-#[derive(Debug, PartialEq, Eq)]
-struct Sources {
+/// The source addresses of the datagrams of a sending socket. A sender that is bound to no address
+/// uses the address of the interface through which a datagram leaves. A datagram of another host
+/// with the same port is not matched.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct OwnSource {
     port: u16,
     addresses: Vec<Ipv4Addr>,
 }
 
+/// The sending sockets of the process, by their local addresses.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ProcessSenders<'a> {
+    /// The sender that belongs to the receiving socket.
+    pub(crate) own: SocketAddr,
+    /// The senders of the other programs of the process.
+    pub(crate) companions: &'a [SocketAddr],
+}
+
 impl OwnFilter {
     /// Sets the filter of a new receiver or a new sender.
-    pub(crate) fn set(&mut self, receiver: &UdpSocket, sender: SocketAddr, present: &[Interface]) {
+    pub(crate) fn set(
+        &mut self,
+        receiver: &UdpSocket,
+        senders: ProcessSenders<'_>,
+        present: &[Interface],
+    ) {
         self.set = None;
-        self.update(receiver, sender, present);
+        self.update(receiver, senders, present);
     }
 
-    /// Sets the filter again if the addresses of this host have changed.
+    /// Sets the filter again if the senders or the addresses of this host have changed.
     pub(crate) fn update(
         &mut self,
         receiver: &UdpSocket,
-        sender: SocketAddr,
+        senders: ProcessSenders<'_>,
         present: &[Interface],
     ) {
-        let sources = Sources::of(sender, present);
+        let source = |sender: &SocketAddr| OwnSource::of(*sender, present);
+        self.companions = senders.companions.iter().map(source).collect();
+        let mut sources = vec![source(&senders.own)];
+        sources.extend_from_slice(&self.companions);
         if self.refused || self.set.as_ref() == Some(&sources) {
             return;
         }
-        match sources.attach(receiver) {
+        match attach(&sources, receiver) {
             Ok(()) => self.set = Some(sources),
             Err(error) => {
                 self.refused = true;
@@ -62,9 +82,14 @@ impl OwnFilter {
             }
         }
     }
+
+    /// Returns whether a datagram comes from another program of the process.
+    pub(crate) fn is_companion(&self, from: SocketAddr) -> bool {
+        self.companions.iter().any(|source| source.contains(from))
+    }
 }
 
-impl Sources {
+impl OwnSource {
     fn of(sender: SocketAddr, present: &[Interface]) -> Self {
         let addresses = match sender.ip() {
             IpAddr::V4(bound) if !bound.is_unspecified() => vec![bound],
@@ -79,22 +104,19 @@ impl Sources {
         }
     }
 
-    /// Attaches the filter, which replaces the previous filter of the socket.
-    fn attach(&self, receiver: &UdpSocket) -> io::Result<()> {
-        let program = self.program().ok_or_else(|| {
-            let many = self.addresses.len();
-            io::Error::other(format!("this host has {many} addresses"))
-        })?;
-        SockRef::from(receiver).attach_filter(&program)
+    fn contains(&self, from: SocketAddr) -> bool {
+        let is_own = |address: &Ipv4Addr| from.ip() == IpAddr::V4(*address);
+        from.port() == self.port && self.addresses.iter().any(is_own)
     }
 
-    /// Returns the filter; `None` if there are too many addresses for its jumps.
+    /// Returns the part of the filter that drops the datagrams of this source. Other datagrams
+    /// reach the instruction behind it. `None` if there are too many addresses for its jumps.
     fn program(&self) -> Option<Vec<SockFilter>> {
         let count = u8::try_from(self.addresses.len()).ok()?;
-        let past_addresses = count.checked_add(1)?;
+        let past_drop = count.checked_add(3)?;
         let mut program = vec![
             SockFilter::new(LOAD_HALF, 0, 0, SOURCE_PORT),
-            SockFilter::new(JUMP_IF_EQUAL, 0, past_addresses, u32::from(self.port)),
+            SockFilter::new(JUMP_IF_EQUAL, 0, past_drop, u32::from(self.port)),
             SockFilter::new(LOAD_WORD, 0, 0, SOURCE_ADDRESS),
         ];
         let to_drop = (0..count).rev().map(|behind| behind + 1);
@@ -106,16 +128,37 @@ impl Sources {
                 u32::from(*address),
             ));
         }
-        program.push(SockFilter::new(RETURN, 0, 0, ACCEPT));
+        program.push(SockFilter::new(JUMP, 0, 0, 1));
         program.push(SockFilter::new(RETURN, 0, 0, DROP));
         Some(program)
     }
+}
+
+/// Returns the filter that drops the datagrams of all sources.
+fn program(sources: &[OwnSource]) -> Option<Vec<SockFilter>> {
+    let parts: Option<Vec<Vec<SockFilter>>> = sources.iter().map(OwnSource::program).collect();
+    let mut program: Vec<SockFilter> = parts?.into_iter().flatten().collect();
+    program.push(SockFilter::new(RETURN, 0, 0, ACCEPT));
+    Some(program)
+}
+
+/// Attaches the filter, which replaces the previous filter of the socket.
+fn attach(sources: &[OwnSource], receiver: &UdpSocket) -> io::Result<()> {
+    let program = program(sources).ok_or_else(|| {
+        let many = sources.iter().map(|source| source.addresses.len()).max();
+        io::Error::other(format!(
+            "this host has {} addresses",
+            many.unwrap_or_default()
+        ))
+    })?;
+    SockRef::from(receiver).attach_filter(&program)
 }
 
 // Instructions of classic BPF, see `Documentation/networking/filter.rst` of Linux.
 const LOAD_HALF: u16 = 0x28;
 const LOAD_WORD: u16 = 0x20;
 const JUMP_IF_EQUAL: u16 = 0x15;
+const JUMP: u16 = 0x05;
 const RETURN: u16 = 0x06;
 /// The filter of a UDP socket sees a datagram from its UDP header on.
 const SOURCE_PORT: u32 = 0;
@@ -153,7 +196,7 @@ mod tests {
         let first = std::net::UdpSocket::bind(("127.0.0.2", 0)).unwrap();
         let port = first.local_addr().unwrap().port();
         let own = sender(SocketAddr::from(([127, 0, 0, 2], port)));
-        let program = Sources::of(own, present).program().unwrap();
+        let program = program(&[OwnSource::of(own, present)]).unwrap();
         SockRef::from(&receiver).attach_filter(&program).unwrap();
         for host in hosts {
             let address = (Ipv4Addr::new(127, 0, 0, *host), port);
@@ -197,9 +240,9 @@ mod tests {
             hosts.collect::<Vec<_>>()
         };
         let unbound = |own: SocketAddr| SocketAddr::from((Ipv4Addr::UNSPECIFIED, own.port()));
-        assert_eq!(received(unbound, &many(254), &[2, 253, 254]), [254]);
-        let sources = Sources::of(SocketAddr::from(([0, 0, 0, 0], 1)), &many(255));
-        assert!(sources.program().is_none());
+        assert_eq!(received(unbound, &many(252), &[2, 251, 252]), [252]);
+        let source = OwnSource::of(SocketAddr::from(([0, 0, 0, 0], 1)), &many(253));
+        assert!(program(&[source]).is_none());
     }
 
     #[test]
@@ -212,13 +255,50 @@ mod tests {
         let receiver = UdpSocket::from_std(socket).unwrap();
         let sender = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 7));
         let [one, two] = [1, 2].map(|host| interface(Ipv4Addr::new(10, 0, 0, host)));
+        let alone = |own| ProcessSenders {
+            own,
+            companions: &[],
+        };
         let mut filter = OwnFilter::default();
-        filter.set(&receiver, sender, std::slice::from_ref(&one));
-        let set = |filter: &OwnFilter| filter.set.as_ref().unwrap().addresses.clone();
+        filter.set(&receiver, alone(sender), std::slice::from_ref(&one));
+        let set = |filter: &OwnFilter| filter.set.as_ref().unwrap()[0].addresses.clone();
         assert_eq!(set(&filter), [one.address]);
-        filter.update(&receiver, sender, &[one.clone(), two.clone()]);
+        filter.update(&receiver, alone(sender), &[one.clone(), two.clone()]);
         assert_eq!(set(&filter), [one.address, two.address]);
-        filter.update(&receiver, SocketAddr::from((two.address, 8)), &[one]);
+        let bound = SocketAddr::from((two.address, 8));
+        filter.update(&receiver, alone(bound), &[one]);
         assert_eq!(set(&filter), [two.address]);
+    }
+
+    #[test]
+    fn datagrams_of_all_programs_of_the_process_are_dropped_and_no_others() {
+        let receiver = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+        let to = receiver.local_addr().unwrap();
+        let timeout = Some(Duration::from_secs(10));
+        receiver.set_read_timeout(timeout).unwrap();
+        let senders = [(); 4].map(|()| std::net::UdpSocket::bind("127.0.0.2:0").unwrap());
+        let all = senders
+            .each_ref()
+            .map(|sender| sender.local_addr().unwrap());
+        let sources: Vec<OwnSource> = all[..3]
+            .iter()
+            .map(|all| OwnSource::of(*all, &[]))
+            .collect();
+        let program = program(&sources).unwrap();
+        SockRef::from(&receiver).attach_filter(&program).unwrap();
+        for (number, sender) in (0_u8..).zip(&senders) {
+            sender.send_to(&[number], to).unwrap();
+        }
+        let mut buffer = [u8::MAX];
+        receiver.recv(&mut buffer).unwrap();
+        assert_eq!(buffer, [3]);
+        let filter = OwnFilter {
+            companions: sources[1..].to_vec(),
+            ..OwnFilter::default()
+        };
+        let companions = all.map(|from| filter.is_companion(from));
+        assert_eq!(companions, [false, true, true, false]);
+        let elsewhere = SocketAddr::from(([127, 0, 0, 3], all[1].port()));
+        assert!(!filter.is_companion(elsewhere));
     }
 }

@@ -8,11 +8,13 @@
 mod batch;
 mod carrier;
 mod filter;
+mod in_process;
 mod interface;
 mod udp;
 mod watch;
 
 pub use carrier::{BUFFER, Carrier, CarrierChange, Outgoing, Received, Senders};
+pub use in_process::ProcessHub;
 pub use interface::{Interface, InterfaceError, interfaces};
 pub use udp::{OpenError, Options, SendError, Udp};
 pub use watch::{Change, Finding, Held, LOOK};

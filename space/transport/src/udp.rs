@@ -14,7 +14,7 @@ use tracing::info;
 
 use crate::batch::{self, Batch};
 use crate::carrier::{Outgoing, Received};
-use crate::filter::OwnFilter;
+use crate::filter::{OwnFilter, ProcessSenders};
 use crate::interface::{Interface, InterfaceError, interfaces};
 use crate::watch::{Change, Wanted, Watch};
 
@@ -36,6 +36,8 @@ pub struct Udp {
     batch: Batch,
     /// Drops own datagrams; `None` if own datagrams are received.
     own_filter: Option<OwnFilter>,
+    /// The senders of the other programs of this process.
+    companions: Vec<SocketAddr>,
 }
 
 /// Addresses and options of a [`Udp`].
@@ -176,7 +178,11 @@ impl Udp {
         let own_filter = (!options.own).then(|| {
             let mut filter = OwnFilter::default();
             // The addresses that cannot be listed at present are added by `follow`.
-            filter.set(&receiver, local, &interfaces().unwrap_or_default());
+            let senders = ProcessSenders {
+                own: local,
+                companions: &[],
+            };
+            filter.set(&receiver, senders, &interfaces().unwrap_or_default());
             filter
         });
         Ok(Self {
@@ -188,6 +194,7 @@ impl Udp {
             watch: options.wanted().and_then(Watch::start),
             batch: Batch::default(),
             own_filter,
+            companions: Vec::new(),
         })
     }
 
@@ -215,13 +222,49 @@ impl Udp {
             self.batch.clear();
         }
         if let Some(filter) = &mut self.own_filter {
+            let senders = ProcessSenders {
+                own: self.local,
+                companions: &self.companions,
+            };
             if is_new {
-                filter.set(&self.receiver, self.local, &present);
+                filter.set(&self.receiver, senders, &present);
             } else {
-                filter.update(&self.receiver, self.local, &present);
+                filter.update(&self.receiver, senders, &present);
             }
         }
         change
+    }
+
+    /// Sets the senders of the other programs of this process, whose datagrams are dropped like own
+    /// datagrams. Without `own` datagrams only.
+    pub(crate) fn drop_companions(&mut self, companions: Vec<SocketAddr>) {
+        self.companions = companions;
+        if let Some(filter) = &mut self.own_filter {
+            let senders = ProcessSenders {
+                own: self.local,
+                companions: &self.companions,
+            };
+            // The addresses that cannot be listed at present are added by `follow`.
+            filter.update(&self.receiver, senders, &interfaces().unwrap_or_default());
+        }
+    }
+
+    /// Returns whether a datagram comes from another program of this process. The kernel may pass
+    /// such datagrams for a moment after a change, or always if it has refused the filter.
+    pub(crate) fn is_companion(&self, from: SocketAddr) -> bool {
+        let filter = self.own_filter.as_ref();
+        filter.is_some_and(|filter| filter.is_companion(from))
+    }
+
+    /// Returns the source address of sent datagrams as receivers probably see it: with the address
+    /// of the watched interface if no address is bound.
+    pub(crate) fn seen_source(&self) -> SocketAddr {
+        match &self.watch {
+            Some(watch) if self.local.ip().is_unspecified() => {
+                SocketAddr::from((watch.interface().address, self.local.port()))
+            }
+            _ => self.local,
+        }
     }
 
     /// Returns the reason why no datagrams are received and sent, as detected by
