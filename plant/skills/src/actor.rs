@@ -467,7 +467,7 @@ impl Actor {
             return self.stop_elsewhere().await;
         }
         if let Ok(ended) = timeout(TIME_TO_STOP, &mut work.task).await {
-            let ended = outcome_of(ended);
+            let ended = outcome_of(ended, &mut work.unknown);
             return match (self.end_stopped(), ended) {
                 (_, Ok(results)) => Stop::Done(results),
                 (true, Err(why)) => Stop::BrokenOff(why),
@@ -509,7 +509,7 @@ impl Actor {
             let happened = tokio::select! {
                 biased;
                 Some(line) = work.reins.steps.recv() => Happened::Line(line),
-                ended = &mut work.task => Happened::Ended(outcome_of(ended)),
+                ended = &mut work.task => Happened::Ended(outcome_of(ended, &mut work.unknown)),
                 () = sleep_until(until) => return Stop::Pending,
             };
             match happened {
@@ -870,6 +870,7 @@ async fn happens(work: &mut Option<Running>) -> Happened {
         reins,
         deadline,
         ended,
+        unknown,
         ..
     }) = work
     else {
@@ -887,20 +888,29 @@ async fn happens(work: &mut Option<Running>) -> Happened {
     tokio::select! {
         biased;
         Some(line) = reins.steps.recv() => Happened::Line(line),
-        ended = task => Happened::Ended(outcome_of(ended)),
+        ended = task => Happened::Ended(outcome_of(ended, unknown)),
         Ok(()) = reins.progress.changed() => Happened::Progress(*reins.progress.borrow_and_update()),
         () = late => Happened::Late,
     }
 }
 
-fn outcome_of(ended: Result<Result<Results, String>, JoinError>) -> Result<Results, String> {
-    match ended {
-        Ok(result) => result,
-        Err(error) => match error.try_into_panic() {
-            Ok(panic) => Err(format!("the driver broke down: {}", text_of(&*panic))),
-            Err(_) => Err("the work was broken off".to_owned()),
-        },
-    }
+/// Returns the result of ended work. A driver that panicked has not stopped its machine: `unknown`
+/// then receives the reason.
+fn outcome_of(
+    ended: Result<Result<Results, String>, JoinError>,
+    unknown: &mut Option<String>,
+) -> Result<Results, String> {
+    let error = match ended {
+        Ok(result) => return result,
+        Err(error) => error,
+    };
+    let why = match error.try_into_panic() {
+        Ok(panic) => format!("the driver broke down: {}", text_of(&*panic)),
+        Err(_) => "the work was broken off".to_owned(),
+    };
+    let why = format!("{why}; the outcome is unknown, check the machine");
+    unknown.get_or_insert_with(|| why.clone());
+    Err(why)
 }
 
 fn text_of(panic: &(dyn Any + Send)) -> &str {

@@ -509,9 +509,13 @@ async fn parameters_of_a_run_are_kept_while_it_goes_on() {
 #[tokio::test]
 async fn a_driver_that_breaks_down_or_fails_leaves_a_halted_skill_that_says_why() {
     for (how, why) in [
-        (How::Panics, "the driver broke down: a wire is loose"),
+        (
+            How::Panics,
+            "the driver broke down: a wire is loose; the outcome is unknown, check the machine",
+        ),
         (How::Fails, "nothing is there"),
     ] {
+        let panics = matches!(how, How::Panics);
         let bench = bench(how);
         let shown = bench.run_to(State::Halted).await;
         let outcome = shown.outcome.clone().unwrap();
@@ -519,6 +523,7 @@ async fn a_driver_that_breaks_down_or_fails_leaves_a_halted_skill_that_says_why(
             (outcome.run, outcome.succeeded, outcome.message.as_str()),
             (1, false, why)
         );
+        assert_eq!(outcome.unknown, panics, "{why}");
         assert_eq!(bench.numbers(), [1, 2, 3]);
         assert!(
             bench.call(Method::Reset).await.is_ok(),
