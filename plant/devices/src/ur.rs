@@ -5,6 +5,7 @@
 //! program of another client is never mistaken for it. Suspending sets the speed slider to zero,
 //! halting brakes along the path.
 
+mod follower;
 mod force;
 mod pose;
 mod rtde;
@@ -24,6 +25,7 @@ use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
 use tokio::time::{Instant, sleep, timeout, timeout_at};
 
+pub use self::follower::Follower;
 use self::force::Guard;
 pub use self::pose::{of_robot, to_robot};
 use self::rtde::Rtde;
@@ -337,11 +339,14 @@ impl Driver for Motion {
         let token = at.started.wrapping_add(1) & i32::MAX;
         work.step("Move").await;
         let program = self.program(work.parameters(), token)?;
-        let _program = self.send(&program).await?;
+        let mut sent = Sent {
+            token,
+            stream: self.send(&program).await?,
+        };
         if let Some(guard) = &mut guard {
             guard.zero(at.force);
         }
-        let ended = session.follow((self, &work), token, &mut guard).await?;
+        let ended = session.follow((self, &work), &mut sent, &mut guard).await?;
         let mut results = match self.kind {
             Kind::Joints => vec![("JointPosition".to_owned(), ended.joints.into())],
             Kind::Ptp | Kind::Linear | Kind::Guarded => {
@@ -445,6 +450,14 @@ async fn unknown(work: &Work, why: &str, stopped: &str) -> String {
     why
 }
 
+/// A program that was sent to the robot.
+struct Sent {
+    /// The value of the registers that the program sets.
+    token: i32,
+    /// The connection, which stays open until the robot has accepted the program.
+    stream: TcpStream,
+}
+
 /// The RTDE connection of a run.
 struct Session {
     rtde: Rtde,
@@ -482,9 +495,10 @@ impl Session {
     async fn follow(
         &mut self,
         (motion, work): (&Motion, &Work),
-        token: i32,
+        sent: &mut Sent,
         guard: &mut Option<Guard>,
     ) -> Result<State, String> {
+        let token = sent.token;
         let asked = Instant::now();
         let mut standing = None;
         loop {
@@ -506,9 +520,14 @@ impl Session {
                 return Err("the program of the robot has ended before its move: another one took its place".to_owned());
             }
             if at.started != token && asked.elapsed() > TAKEN {
-                return Err(format!(
+                let why = format!(
                     "the robot has not taken the program within {TAKEN:?}: is it in remote control?"
-                ));
+                );
+                return Err(self.withdraw((motion, work), sent, &why).await?);
+            }
+            if at.started != token && is(work.stopped()).await {
+                let why = "halted before the robot has taken the program";
+                return Err(self.withdraw((motion, work), sent, why).await?);
             }
             let can_stand = self.rtde.may_tell();
             match (is(work.stopped()).await, is(work.held()).await, standing) {
@@ -528,6 +547,34 @@ impl Session {
                 (false, true, Some(_)) | (false, false, None) => {}
             }
         }
+    }
+
+    /// Stops a program that the robot has not started. The stop program follows on the same
+    /// connection, so that a robot that accepts the program late stops it at once. Returns the
+    /// reason with the position of the robot.
+    ///
+    /// # Errors
+    /// The robot may accept the program later: the outcome is unknown.
+    async fn withdraw(
+        &mut self,
+        (motion, work): (&Motion, &Work),
+        sent: &mut Sent,
+        why: &str,
+    ) -> Result<String, String> {
+        let stop = motion.stop_program().as_bytes();
+        match timeout(BRAKED, sent.stream.write_all(stop)).await {
+            Ok(Ok(())) => {}
+            Ok(Err(_)) | Err(_) => return Err(unknown(work, why, NOT_SENT).await),
+        }
+        let until = Instant::now() + BRAKED;
+        // The connection is not used after a dropped future.
+        while let Ok(Ok(at)) = timeout_at(until, self.state()).await {
+            if at.started == sent.token {
+                let [x, y, z, ..] = self.stand(work).await?.pose;
+                return Ok(format!("{why}; stopped at {x:.3}, {y:.3}, {z:.3} m"));
+            }
+        }
+        Err(unknown(work, why, SENT).await)
     }
 
     /// Brakes at the force limit, and returns the state of the robot after that.
@@ -596,33 +643,6 @@ impl Session {
     }
 }
 
-/// A client that receives the tool position of a robot.
-#[derive(Debug)]
-pub struct Follower(Rtde);
-
-impl Follower {
-    /// Connects to the robot with RTDE at `host:port`.
-    ///
-    /// # Errors
-    /// Returns the reason for users if the robot does not answer.
-    pub async fn open(rtde: &str) -> Result<Self, String> {
-        Rtde::open(rtde, FOLLOWED, &["actual_TCP_pose"], &[])
-            .await
-            .map(Self)
-    }
-
-    /// Returns the next position: m, and rotations about x, y and z in rad. Not cancel-safe.
-    ///
-    /// # Errors
-    /// Fails if the connection is lost, or silent for a second.
-    pub async fn position(&mut self) -> Result<[f64; 6], String> {
-        match self.0.next().await?.as_slice() {
-            [Value::Vector(pose)] => Ok(of_robot(*pose)),
-            _ => Err("the robot tells a position of another type".to_owned()),
-        }
-    }
-}
-
 /// Returns whether a future is ready now.
 async fn is(ready: impl Future<Output = ()>) -> bool {
     tokio::select! {
@@ -645,7 +665,6 @@ const PLAYING: u32 = 2;
 const HERTZ: f64 = 50.0;
 /// Rate of the state of a move with a force limit, Hz.
 const GUARDED: f64 = 125.0;
-const FOLLOWED: f64 = 500.0;
 /// Highest rate of values for clients, Hz.
 const FASTEST_VALUES: f64 = 125.0;
 const TAKEN: Duration = Duration::from_secs(2);

@@ -100,6 +100,13 @@ impl Simulator {
         self.lock().pose
     }
 
+    /// Returns an output register; 0 if there is no such register.
+    #[must_use]
+    pub fn register(&self, number: usize) -> i32 {
+        let robot = self.lock();
+        robot.registers.get(number).copied().unwrap_or_default()
+    }
+
     /// Sets the pose of the tool and ends the running program.
     pub fn reset(&self, pose: [f64; 6]) {
         let mut robot = self.lock();

@@ -266,6 +266,58 @@ async fn a_force_move_ends_at_a_contact_and_says_the_force() {
     assert!(z > 0.31, "it stands at {z}");
 }
 
+/// Receives the programs for a robot, and forwards them when it is told to.
+async fn late(robot: std::net::SocketAddr) -> (String, tokio::sync::oneshot::Sender<()>) {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let (forward, told) = tokio::sync::oneshot::channel();
+    tokio::spawn(async move {
+        let (mut from, _) = listener.accept().await.unwrap();
+        told.await.unwrap();
+        let mut to = TcpStream::connect(robot).await.unwrap();
+        let (mut reads, _writes) = from.split();
+        tokio::io::copy(&mut reads, &mut to).await.unwrap();
+        // Open while the robot reads the programs.
+        std::future::pending::<()>().await;
+    });
+    (address, forward)
+}
+
+#[tokio::test]
+async fn a_program_that_is_taken_too_late_is_unknown_and_does_not_move_the_robot() {
+    let bench = bench_at(1.0, None).await;
+    let (secondary, forward) = late(bench.serving.secondary()).await;
+    let settings = Settings {
+        secondary,
+        ..bench.settings()
+    };
+    let driver = Robot::new(settings)
+        .driver(
+            &[TypeName::own("LinearMoveSkillType")],
+            &PeerAccess::default(),
+        )
+        .unwrap();
+    let target = to([-0.4, 0.1, 0.4, 0.0, 0.0, 0.0]);
+    let outcome = conformance::run_once("LinearMoveSkillType", driver, target)
+        .await
+        .unwrap();
+    let why = "is it in remote control?; the outcome is unknown, the stop program is sent";
+    assert!(outcome.message.ends_with(why), "{}", outcome.message);
+    assert!(outcome.unknown, "{outcome:?}");
+    let before = bench.simulator.pose();
+    let started = bench.simulator.register(24);
+    forward.send(()).unwrap();
+    let limit = Instant::now() + Duration::from_secs(5);
+    while bench.simulator.register(24) == started {
+        assert!(Instant::now() < limit, "the robot takes no program");
+        sleep(Duration::from_millis(5)).await;
+    }
+    // A move would take two seconds.
+    sleep(Duration::from_millis(200)).await;
+    let moved = before.iter().zip(bench.simulator.pose());
+    assert!(moved.map(|(a, b)| (a - b).abs()).sum::<f64>() < 0.005);
+}
+
 /// A run that brakes a robot of which another client has the speed slider.
 struct Brakes {
     settings: Arc<Settings>,

@@ -1,0 +1,35 @@
+//! A client that receives the tool position of a robot.
+
+use super::of_robot;
+use super::rtde::Rtde;
+use super::wire::Value;
+
+/// A client that receives the tool position of a robot.
+#[derive(Debug)]
+pub struct Follower(Rtde);
+
+impl Follower {
+    /// Connects to the robot with RTDE at `host:port`.
+    ///
+    /// # Errors
+    /// Returns the reason for users if the robot does not answer.
+    pub async fn open(rtde: &str) -> Result<Self, String> {
+        Rtde::open(rtde, FOLLOWED, &["actual_TCP_pose"], &[])
+            .await
+            .map(Self)
+    }
+
+    /// Returns the next position: m, and rotations about x, y and z in rad. Not cancel-safe.
+    ///
+    /// # Errors
+    /// Fails if the connection is lost, or silent for a second.
+    pub async fn position(&mut self) -> Result<[f64; 6], String> {
+        match self.0.next().await?.as_slice() {
+            [Value::Vector(pose)] => Ok(of_robot(*pose)),
+            _ => Err("the robot tells a position of another type".to_owned()),
+        }
+    }
+}
+
+/// Rate of the positions, Hz.
+const FOLLOWED: f64 = 500.0;
