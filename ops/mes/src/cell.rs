@@ -328,6 +328,13 @@ impl Cell {
         taken.is_ok()
     }
 
+    /// Removes the components that a server, which discovery found under this name, has no more.
+    pub(crate) fn keeps_only(&self, discovered: &str, is_there: impl Fn(&str) -> bool) {
+        let gone =
+            |known: &Component| known.discovered == discovered && !is_there(&known.application_uri);
+        self.remove(gone, "its station has lost it");
+    }
+
     /// Removes a server that discovery has lost.
     pub(crate) fn went(&self, discovered: &str, why: &str) {
         self.remove(|component| component.discovered == discovered, why);

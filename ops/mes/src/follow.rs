@@ -1,7 +1,7 @@
 //! Updates the graph from discovery: queries the skills of discovered servers, and removes lost
 //! servers.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -80,37 +80,69 @@ async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
 
 async fn once(cell: &Cell, seen: &Seen) -> Result<(), SkillFault> {
     let client = SkillClient::connect(&seen.url, cell.client()).await?;
-    let found = client.skills().await;
-    let uri = client.application_uri();
-    let listed = now();
-    let found = match found {
-        Ok(found) if found.is_empty() => {
-            client.close().await;
-            debug!(url = seen.url, "a server has no skills");
-            // Another announcement of the server starts another query.
-            return std::future::pending().await;
-        }
-        Ok(found) => found,
+    let read = async {
+        let changes = client.station_changes().await?;
+        Ok((changes, client.skills().await?))
+    };
+    let (changes, found) = match read.await {
+        Ok(read) => read,
         Err(fault) => {
             client.close().await;
             return Err(fault);
         }
     };
+    if found.is_empty() && changes.is_none() {
+        client.close().await;
+        debug!(url = seen.url, "a server has no skills");
+        // Another announcement of the server starts another query.
+        return std::future::pending().await;
+    }
+    let uri = client.application_uri();
     if uri.is_empty() {
         client.close().await;
         return Err(SkillFault::Unexpected(
             "it does not say who it is".to_owned(),
         ));
     }
-    cell.came(seen, &uri, found.clone(), listed);
-    let facts = ComponentFacts {
-        application_uri: uri.clone(),
-        ..ComponentFacts::default()
+    let components = by_component(&uri, &found);
+    cell.keeps_only(&seen.name, |uri| components.contains_key(uri));
+    let listed = now();
+    for (of, found) in &components {
+        let Some(first) = found.first() else { continue };
+        let seen = Seen {
+            url: first.endpoint(&seen.url),
+            ..seen.clone()
+        };
+        cell.came(&seen, of, found.clone(), listed);
+    }
+    let iri = |found: &FoundSkill| {
+        let facts = ComponentFacts {
+            application_uri: found.behind.clone().unwrap_or_else(|| uri.clone()),
+            ..ComponentFacts::default()
+        };
+        Some(facts.skill_iri(&NodeName::parse(&found.node)?))
     };
-    let iri = |found: &FoundSkill| Some(facts.skill_iri(&NodeName::parse(&found.node)?));
-    live::skills(cell.knowledge(), &client, (&uri, &found), iri).await;
+    let states = live::skills(cell.knowledge(), &client, (&uri, &found), iri);
+    match changes {
+        Some(mut changes) => tokio::select! {
+            () = states => {}
+            () = changes.next() => {}
+        },
+        None => states.await,
+    }
     client.close().await;
     Ok(())
+}
+
+/// Returns the skills by the ApplicationUris of their components: the server itself, or the
+/// components behind a station.
+fn by_component(server: &str, found: &[FoundSkill]) -> BTreeMap<String, Vec<FoundSkill>> {
+    let mut components: BTreeMap<String, Vec<FoundSkill>> = BTreeMap::new();
+    for skill in found {
+        let of = skill.behind.as_deref().unwrap_or(server).to_owned();
+        components.entry(of).or_default().push(skill.clone());
+    }
+    components
 }
 
 fn is_loopback(url: &str) -> bool {

@@ -34,6 +34,10 @@ pub(crate) struct Peer {
     pub(crate) certificates_refused: u64,
     pub(crate) methods: usize,
     pub(crate) methods_kept_back: usize,
+    pub(crate) variables: usize,
+    pub(crate) variables_kept_back: usize,
+    /// Number of notifications of values and events that were lost.
+    pub(crate) notifications_lost: u64,
     /// The place that it was configured with.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) place: Option<String>,

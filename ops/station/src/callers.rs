@@ -7,9 +7,9 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
-use plant_opcua::client::{Client, ClientError, Link};
+use plant_opcua::client::{Client, ClientError};
 use plant_opcua::server::Caller;
-use plant_opcua::types::StatusCode;
+use plant_opcua::types::{DateTime, StatusCode};
 use plant_opcua::users::{Access, Role, Roles};
 use tokio::time::Instant;
 
@@ -46,6 +46,8 @@ impl Admission {
 pub(crate) struct Callers {
     /// The session of the station itself.
     client: Client,
+    /// The run of the server for which the shown NodeIds are valid, by its start time.
+    run: Mutex<Option<DateTime>>,
     sessions: Mutex<BTreeMap<u32, Client>>,
 }
 
@@ -53,8 +55,15 @@ impl Callers {
     pub(crate) fn new(client: Client) -> Self {
         Self {
             client,
+            run: Mutex::default(),
             sessions: Mutex::default(),
         }
+    }
+
+    /// Sets the run of the server for which the shown NodeIds are valid. Without a run, no call is
+    /// forwarded.
+    pub(crate) fn serve(&self, run: Option<DateTime>) {
+        *self.run.lock().unwrap_or_else(PoisonError::into_inner) = run;
     }
 
     /// Returns the client of a caller, connected to the same run of the server as the station
@@ -62,11 +71,7 @@ impl Callers {
     ///
     /// # Errors
     /// There is no such connection.
-    pub(crate) async fn client_of(
-        &self,
-        session: u32,
-        connects: u64,
-    ) -> Result<Client, ClientError> {
+    pub(crate) async fn client_of(&self, session: u32) -> Result<Client, ClientError> {
         let client = {
             let mut sessions = self.lock();
             let own = sessions.entry(session);
@@ -79,9 +84,12 @@ impl Callers {
                 return Err(error);
             }
         }
-        let is_current = matches!(&*self.client.link().borrow(), Link::Up { connects: now, .. } if *now == connects);
-        // NodeIds are valid as long as the namespaces are the same.
-        if is_current && client.namespaces() == self.client.namespaces() {
+        let run = *self.run.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_current = run.is_some() && client.started() == run;
+        // NodeIds are valid as long as the namespaces are the same. A server may have added further
+        // namespaces between the two connections.
+        let (ours, theirs) = (self.client.namespaces(), client.namespaces());
+        if is_current && ours.iter().zip(&theirs).all(|(our, their)| our == their) {
             return Ok(client);
         }
         let another = "the server was restarted".to_owned();

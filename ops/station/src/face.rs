@@ -1,26 +1,25 @@
-//! A server that shows the methods of other servers and forwards their calls.
+//! A server that shows the nodes of other servers and forwards their calls and writes.
 
-use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
 use plant_opcua::changes::{Became, ModelChange};
-use plant_opcua::client::{CallOptions, ClientError};
+use plant_opcua::client::{CallOptions, Client, ClientError};
 use plant_opcua::limits::ClientLimits;
 use plant_opcua::server::{
-    EndpointUrl, InstanceError, MethodHandler, MethodRequest, MethodSpec, ObjectSpec, Refusal,
-    Security, Server, ServerBuilder, ServerConfig, ServerError, VariableSpec,
+    Caller, EndpointUrl, InstanceError, MethodHandler, MethodRequest, ObjectSpec, Presence,
+    Refusal, Security, Server, ServerBuilder, ServerConfig, ServerError, VariableSpec,
+    WriteHandler, WriteRequest,
 };
 use plant_opcua::types::{
     DataTypeId, DataValue, LocalizedText, NodeId, ObjectId, ObjectTypeId, QualifiedName,
     ReferenceTypeId, StatusCode, VariableTypeId, Variant,
 };
-use tracing::{debug, warn};
+use tracing::warn;
 
 use crate::callers::{Admission, AllCallers, Callers};
-use crate::mirror::{Found, Mirror};
 
 /// A face of a station: its server on a level.
 #[derive(Clone)]
@@ -44,17 +43,6 @@ pub(crate) struct FaceSettings {
     /// Checks callers.
     pub(crate) admission: Admission,
     pub(crate) clients: ClientLimits,
-}
-
-/// A server to be shown.
-pub(crate) struct Shown<'a> {
-    /// Its name below the folder.
-    pub(crate) name: &'a str,
-    pub(crate) application_uri: &'a str,
-    pub(crate) mirror: &'a Mirror,
-    pub(crate) callers: &'a Arc<Callers>,
-    /// The number of the connection for which its NodeIds are valid.
-    pub(crate) connects: u64,
 }
 
 impl Face {
@@ -103,86 +91,29 @@ impl Face {
         self.callers.add(callers);
     }
 
-    /// Shows the methods of a server, replacing the methods shown before, and notifies clients.
-    ///
-    /// # Errors
-    /// The folder does not exist.
-    pub(crate) fn show(&self, shown: &Shown<'_>) -> Result<(), InstanceError> {
-        self.server.remove(&self.root(shown.name));
-        let made = self.add(shown);
-        self.tell(shown.name, Became::Added);
-        made
-    }
-
-    fn add(&self, shown: &Shown<'_>) -> Result<(), InstanceError> {
-        let root = format!("{}/{}", self.folder, shown.name);
-        self.object(&root, &id(self.folder), shown.name)?;
-        self.property(&root, "ApplicationUri", shown.application_uri)?;
-        let mut objects = BTreeSet::new();
-        for found in &shown.mirror.methods {
-            let handler = Arc::new(Passing {
-                admission: self.admission.clone(),
-                callers: Arc::clone(shown.callers),
-                connects: shown.connects,
-                object: found.object.clone(),
-                method: found.method.clone(),
-            });
-            match self.method(&root, found, &mut objects, handler) {
-                // Methods that differ only in their namespaces: the first is shown.
-                Err(InstanceError::Taken(node)) => debug!(%node, "cannot show a method"),
-                made => made?,
-            }
-        }
-        Ok(())
-    }
-
     /// Removes a server, and notifies clients.
     pub(crate) fn remove(&self, name: &str) {
-        self.server.remove(&self.root(name));
-        self.tell(name, Became::Deleted);
+        let root = id(&format!("{}/{name}", self.folder));
+        self.server.remove(&root);
+        self.tell(&root, Became::Deleted);
     }
 
-    /// Returns the NodeId of a server's object.
-    fn root(&self, name: &str) -> NodeId {
-        id(&format!("{}/{name}", self.folder))
+    /// Returns the folder of the servers that are shown.
+    pub(crate) fn folder(&self) -> &'static str {
+        self.folder
     }
 
-    fn tell(&self, name: &str, became: Became) {
+    pub(crate) fn admission(&self) -> &Admission {
+        &self.admission
+    }
+
+    /// Notifies clients that a server was added, changed or removed.
+    pub(crate) fn tell(&self, root: &NodeId, became: Became) {
         self.server.tell_changes(&[ModelChange {
-            node: self.root(name),
+            node: root.clone(),
             type_definition: ObjectTypeId::FolderType.into(),
             became,
         }]);
-    }
-
-    fn method(
-        &self,
-        root: &str,
-        found: &Found,
-        objects: &mut BTreeSet<String>,
-        handler: Arc<dyn MethodHandler>,
-    ) -> Result<(), InstanceError> {
-        let Some((name, above)) = found.path.split_last() else {
-            return Ok(());
-        };
-        let mut parent = root.to_owned();
-        for step in above {
-            let path = format!("{parent}/{step}");
-            if objects.insert(path.clone()) {
-                self.object(&path, &id(&parent), step)?;
-            }
-            parent = path;
-        }
-        let path = format!("{parent}/{name}()");
-        let spec = MethodSpec {
-            node_id: id(&path),
-            browse_name: QualifiedName::new(OWN, name.as_str()),
-            object: id(&parent),
-            arguments: (id(&format!("{path}.in")), id(&format!("{path}.out"))),
-            takes: found.takes.clone(),
-            gives: found.gives.clone(),
-        };
-        self.server.add_method(spec, handler)
     }
 
     /// Adds an object without children.
@@ -232,48 +163,89 @@ pub(crate) fn id(path: &str) -> NodeId {
     NodeId::new(OWN, path)
 }
 
-/// Forwards a call in the session that its caller has at the server.
-struct Passing {
-    admission: Admission,
-    callers: Arc<Callers>,
-    connects: u64,
-    object: NodeId,
-    method: NodeId,
+/// Forwards requests in the session that their caller has at the server.
+pub(crate) struct Passing {
+    pub(crate) admission: Admission,
+    pub(crate) callers: Arc<Callers>,
+}
+
+impl Passing {
+    /// Returns the session of a caller at the server.
+    async fn session(
+        &self,
+        caller: &Caller,
+        presence: &Presence,
+        what: &str,
+    ) -> Result<Client, StatusCode> {
+        self.admission.check(caller).inspect_err(|_| {
+            warn!(
+                application = ?caller.application_uri, user = ?caller.user, what,
+                "refused request: the caller needs the role operator"
+            );
+        })?;
+        let client = self.callers.client_of(caller.session).await;
+        let client = client.map_err(status)?;
+        if !presence.lasts() {
+            // The caller disconnected while its session at the server was created.
+            self.callers.gone(caller.session);
+            return Err(StatusCode::BadSessionClosed);
+        }
+        Ok(client)
+    }
+}
+
+/// Forwards calls of a method.
+pub(crate) struct Calling {
+    pub(crate) passing: Passing,
+    pub(crate) object: NodeId,
+    pub(crate) method: NodeId,
 }
 
 #[async_trait]
-impl MethodHandler for Passing {
+impl MethodHandler for Calling {
     fn longest(&self) -> Duration {
         LONGEST_CALL
     }
 
     async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, Refusal> {
-        let caller = &request.caller;
-        self.admission.check(caller).inspect_err(|_| {
-            warn!(
-                application = ?caller.application_uri, user = ?caller.user, method = request.name,
-                "refused call: the caller needs the role operator"
-            );
-        })?;
+        let session = self
+            .passing
+            .session(&request.caller, &request.presence, &request.name);
+        let client = session.await.map_err(Refusal::Status)?;
         let options = CallOptions {
             // The forwarded call times out first, so that the caller receives its status.
             within: LONGEST_CALL * 9 / 10,
             connection: None,
         };
         let target = (&self.object, &self.method);
-        let client = self.callers.client_of(caller.session, self.connects);
-        let client = client
-            .await
-            .map_err(|error| Refusal::Status(status(error)))?;
-        if !request.presence.lasts() {
-            // The caller disconnected while its session at the server was created.
-            self.callers.gone(caller.session);
-            return Err(Refusal::Status(StatusCode::BadSessionClosed));
-        }
         let called = client.call_result(target, request.arguments, options);
         match called.await {
             Ok(result) => Err(Refusal::PassedOn(Box::new(result))),
             Err(error) => Err(Refusal::Status(status(error))),
+        }
+    }
+}
+
+/// Forwards writes of a variable.
+pub(crate) struct Writing {
+    pub(crate) passing: Passing,
+    pub(crate) node: NodeId,
+}
+
+#[async_trait]
+impl WriteHandler for Writing {
+    async fn write(&self, request: WriteRequest) -> Result<(), StatusCode> {
+        let what = request.node.to_string();
+        let session = self
+            .passing
+            .session(&request.caller, &request.presence, &what);
+        let client = session.await?;
+        let value = request.value.value.unwrap_or_default();
+        let written = client.write(&[(self.node.clone(), value)]).await;
+        match written.map_err(status)?.first() {
+            Some(written) if written.is_good() => Ok(()),
+            Some(refused) => Err(*refused),
+            None => Err(StatusCode::BadUnexpectedError),
         }
     }
 }

@@ -2,9 +2,9 @@
 //! level from the devices.
 //!
 //! A station is a Local Discovery Server for the level below ([`discovery::lds`]) and an
-//! application with two faces. The face above shows the methods of the devices, the face below
-//! shows the methods of the neighbours above. Calls are forwarded. Addresses of one level are not
-//! visible on the other.
+//! application with two faces. The face above shows the objects, variables and methods of the
+//! devices, the face below those of the neighbours above. Calls and writes are forwarded, values
+//! and events are repeated. Addresses of one level are not visible on the other.
 //!
 //! Servers that appear on the level below are configured: the station connects, compares the
 //! certificate with the registration, and calls the method `Configure` of the component with its
@@ -13,7 +13,9 @@
 //! Reading order:
 //!
 //! - `configure`: the method
-//! - `mirror`: the methods of a server
+//! - `mirror`: the nodes of a server
+//! - `copy`: these nodes on the other level
+//! - `feed`: their values and events
 //! - `callers`: the permissions of callers
 //! - `face`: the servers that show methods
 //! - `board`: the state of both levels
@@ -24,8 +26,10 @@
 mod board;
 mod callers;
 mod configure;
+mod copy;
 pub mod entry;
 mod face;
+mod feed;
 mod marks;
 mod mirror;
 mod station;

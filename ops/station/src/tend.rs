@@ -1,24 +1,28 @@
-//! Supervises a server of a level: identifies it, configures its place and shows its methods, until
-//! it is lost.
+//! Supervises a server of a level: identifies it, configures its place and shows its nodes, until it
+//! is lost.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
 use discovery::client::{Application, find_servers};
+use plant_opcua::changes::Became;
 use plant_opcua::client::{
     CallError, Client, ClientConfig, ClientError, Link, Notice, Select, Subscription, Watch,
 };
-use plant_opcua::types::{ObjectId, ObjectTypeId};
+use plant_opcua::types::{ObjectId, ObjectTypeId, StatusCode};
 use registry::hierarchy::Place;
 use tokio::sync::watch;
-use tokio::time::sleep;
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, sleep};
 use tracing::{info, warn};
 
 use crate::board::{BUSY, Board, CONNECTED, Level};
 use crate::callers::Callers;
 use crate::configure::Told;
-use crate::face::{Face, Shown};
+use crate::copy::{CopiedVariable, ServerCopy};
+use crate::face::Face;
+use crate::feed::{self, Target};
 use crate::mirror::{self, Mirror};
 
 /// Data that the supervisors of all servers of a level share.
@@ -57,11 +61,14 @@ impl Tending {
         }
         let mut link = client.link();
         let mut place = self.place.clone();
+        let mut copy = self.face.as_ref().map(|face| {
+            let identity = (name.as_str(), application.application_uri.as_str());
+            ServerCopy::new(face, identity, &callers)
+        });
         loop {
             let now = link.borrow_and_update().clone();
             match now {
                 Link::Up {
-                    connects,
                     application_uri,
                     secured,
                     ..
@@ -70,14 +77,15 @@ impl Tending {
                         let of = Connected {
                             client: &client,
                             callers: &callers,
-                            connects,
                             secured,
                             url: &url,
                             name: &name,
-                            uri: &application_uri,
                             told: tokio::sync::Mutex::default(),
                         };
-                        self.connected(&of, &mut place, &mut link).await;
+                        self.connected(&of, &mut copy, &mut place, &mut link).await;
+                        if let Some(copy) = &copy {
+                            copy.lose(StatusCode::BadNoCommunication);
+                        }
                         continue;
                     }
                     let fault = format!(
@@ -143,22 +151,28 @@ impl Tending {
     async fn connected(
         &self,
         of: &Connected<'_>,
+        copy: &mut Option<ServerCopy>,
         place: &mut Option<watch::Receiver<Option<Place>>>,
         link: &mut watch::Receiver<Link>,
     ) {
         let mut known = None;
+        let mut feeds = Feeds::default();
         let mut changes = of.client.subscribe(vec![model_changes()], TOLD_EVERY, 10);
         loop {
+            let began = Instant::now();
             // A server that executes a method may not respond to other requests.
             if known.is_none() || !of.client.is_calling() {
                 match mirror::look(of.client).await {
                     Ok(looked) if known.as_ref() != Some(&looked) => {
-                        self.show(of, &looked);
+                        self.show(of, &looked, copy.as_mut(), &mut feeds).await;
                         known = Some(looked);
                     }
-                    Ok(_) => self.answers_again(of),
+                    Ok(_) => self.answers_again(of, copy.as_ref()),
                     Err(_) if of.client.is_calling() => {}
                     Err(ClientError::Lost(_)) if known.is_some() => {
+                        if let Some(copy) = &copy {
+                            copy.doubt(true);
+                        }
                         self.fault(of.url, BUSY, ANSWERS_NOTHING.to_owned());
                     }
                     Err(error) => self.fault(of.url, "waiting", error.to_string()),
@@ -188,6 +202,7 @@ impl Tending {
             tokio::select! {
                 changed = link.changed() => {
                     drop(changed);
+                    feeds.stop().await;
                     return;
                 }
                 () = told => {}
@@ -195,50 +210,109 @@ impl Tending {
                 // device appears or disappears.
                 () = changed(&mut changes), if is_told => {}
                 // Not every server notifies model changes.
-                () = sleep(LOOK_AGAIN) => {}
+                () = sleep(LOOK_AGAIN.max(began.elapsed() * LOOK_SELDOM)) => {}
             }
         }
     }
 
-    /// Shows the methods of a server.
-    fn show(&self, of: &Connected<'_>, looked: &Mirror) {
-        if let Some(face) = &self.face {
-            let shown = face.show(&Shown {
-                name: of.name,
-                application_uri: of.uri,
-                mirror: looked,
-                callers: of.callers,
-                connects: of.connects,
-            });
-            if let Err(error) = shown {
-                warn!(name = of.name, %error, "cannot show the methods of a server");
+    /// Shows the nodes of a server, and repeats its values and events.
+    async fn show(
+        &self,
+        of: &Connected<'_>,
+        looked: &Mirror,
+        copy: Option<&mut ServerCopy>,
+        feeds: &mut Feeds,
+    ) {
+        of.callers.serve(of.client.started());
+        if let Some(copy) = copy {
+            match copy.show(looked) {
+                Ok((added, changed)) => {
+                    let target = Target {
+                        face: copy.face().server.clone(),
+                        translation: copy.translation(),
+                        root: copy.root(),
+                        name: of.name.to_owned(),
+                    };
+                    target.read(of.client, &added).await;
+                    self.feed(of, looked, (copy, added, target), feeds);
+                    if changed {
+                        copy.face().tell(&copy.root(), Became::Added);
+                    }
+                }
+                Err(error) => warn!(name = of.name, %error, "cannot show a server"),
             }
         }
+        let (methods, variables) = (looked.methods(), looked.variables());
         self.board.note(self.level, of.url, |peer| {
             peer.state = CONNECTED;
             peer.secured = of.secured;
             peer.fault = None;
-            peer.methods = looked.methods.len();
-            peer.methods_kept_back = looked.kept_back;
+            peer.methods = methods;
+            peer.variables = variables;
+            peer.methods_kept_back = looked.methods_kept_back;
+            peer.variables_kept_back = looked.variables_kept_back;
         });
-        let methods = looked.methods.len();
         info!(
             name = of.name,
             url = of.url,
             methods,
-            "showing the methods of a server"
+            variables,
+            "showing the methods and values of a server"
         );
     }
 
+    /// Starts to repeat the values that were added and, once for a connection, the events.
+    fn feed(
+        &self,
+        of: &Connected<'_>,
+        looked: &Mirror,
+        (copy, added, target): (&ServerCopy, Vec<CopiedVariable>, Target),
+        feeds: &mut Feeds,
+    ) {
+        let lost = || {
+            let (board, level, url) = (Arc::clone(&self.board), self.level, of.url.to_owned());
+            move |lost: u64| {
+                board.note(level, &url, |peer| {
+                    peer.notifications_lost = peer.notifications_lost.saturating_add(lost);
+                });
+            }
+        };
+        if feeds.events_of.as_ref() != Some(&looked.event_fields) {
+            let (client, fields) = (of.client.clone(), looked.event_fields.clone());
+            let events = feed::events(client, fields.clone(), target.clone(), lost());
+            feeds.events = Some(FeedTask::spawn(events));
+            feeds.events_of = Some(fields);
+        }
+        // After a reconnect all variables are requested; of a changed server only the new ones.
+        let is_first = feeds.values.is_empty();
+        let variables = match is_first || feeds.values.len() >= MOST_FEEDS {
+            true => copy.variables(),
+            false => added,
+        };
+        if variables.is_empty() {
+            return;
+        }
+        if feeds.values.len() >= MOST_FEEDS {
+            feeds.values.clear();
+        }
+        let values = feed::values(of.client.clone(), variables, target, lost());
+        feeds.values.push(FeedTask::spawn(values));
+    }
+
     /// Records that a busy server responds again.
-    fn answers_again(&self, of: &Connected<'_>) {
+    fn answers_again(&self, of: &Connected<'_>, copy: Option<&ServerCopy>) {
+        let mut was_busy = false;
         self.board.note(self.level, of.url, |peer| {
             if peer.state == BUSY {
                 info!(name = peer.name, url = of.url, "the server responds again");
                 peer.state = CONNECTED;
                 peer.fault = None;
+                was_busy = true;
             }
         });
+        if let Some(copy) = copy.filter(|_| was_busy) {
+            copy.doubt(false);
+        }
     }
 
     /// Configures the place of the server until that succeeds, then waits for another place.
@@ -350,13 +424,50 @@ async fn changed(changes: &mut Subscription) {
 struct Connected<'a> {
     client: &'a Client,
     callers: &'a Arc<Callers>,
-    connects: u64,
     secured: bool,
     url: &'a str,
     name: &'a str,
-    uri: &'a str,
     /// The place of the station with which the server was last configured.
     told: tokio::sync::Mutex<Option<Place>>,
+}
+
+/// The tasks that repeat the values and events of a server for the lifetime of a connection.
+#[derive(Default)]
+struct Feeds {
+    events: Option<FeedTask>,
+    /// The declared fields that the events are requested with.
+    events_of: Option<Vec<Select>>,
+    values: Vec<FeedTask>,
+}
+
+impl Feeds {
+    /// Ends the tasks. None of them shows a value afterwards.
+    async fn stop(&mut self) {
+        for task in self.values.drain(..).chain(self.events.take()) {
+            task.stop().await;
+        }
+    }
+}
+
+/// A task that ends with its owner.
+struct FeedTask(JoinHandle<()>);
+
+impl FeedTask {
+    fn spawn(task: impl Future<Output = ()> + Send + 'static) -> Self {
+        Self(tokio::spawn(task))
+    }
+
+    async fn stop(mut self) {
+        self.0.abort();
+        // The error of a cancelled task.
+        let _cancelled = (&mut self.0).await;
+    }
+}
+
+impl Drop for FeedTask {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
 }
 
 /// The fault of a server that is probably executing a method.
@@ -366,5 +477,9 @@ const ASK_LIMIT: Duration = Duration::from_secs(2);
 /// Publishing interval of the subscription to model changes.
 const TOLD_EVERY: Duration = Duration::from_millis(50);
 const LOOK_AGAIN: Duration = Duration::from_secs(2);
+/// A search of a server's nodes takes at most one part in so many of the time.
+const LOOK_SELDOM: u32 = 20;
+/// Number of subscriptions at a server that grows, before they become one again.
+const MOST_FEEDS: usize = 16;
 const FIRST_WAIT: Duration = Duration::from_millis(250);
 const MOST_WAIT: Duration = Duration::from_secs(30);

@@ -8,6 +8,7 @@
 //! - `grip`: the grip point of a skill
 //! - `handle`: a skill of a server
 //! - `states`: the states of the skills of a server
+//! - `stations`: the components behind a station
 //! - `mirror`: the skills of a server, presented like local skills
 //! - `detector`: the skills of all servers
 //! - `peers`: how the skills of a component reach other components
@@ -28,6 +29,7 @@ mod remote;
 #[cfg(test)]
 mod secured_tests;
 mod states;
+mod stations;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -45,6 +47,7 @@ pub use mirror::{Mirror, Mirrors, Watchable};
 pub use peers::PeerAccess;
 pub use remote::Remote;
 pub use states::SkillStates;
+pub use stations::StationChanges;
 
 use crate::parameters::TypeName;
 use crate::runs::SkillFault;
@@ -88,10 +91,13 @@ impl Default for ClientOptions {
 pub struct SkillClient {
     client: Client,
     endpoint: String,
+    /// The ApplicationUri of the component behind a station to which the client is restricted.
+    behind: Option<String>,
 }
 
 impl SkillClient {
-    /// Connects to the server at `endpoint`.
+    /// Connects to the server at `endpoint`. An endpoint that ends with `#` and an ApplicationUri is
+    /// that of a component behind a station: the client sees only the skills of this component.
     ///
     /// # Errors
     /// - [`SkillFault::Refused`] if the certificate of the server is not accepted
@@ -104,11 +110,16 @@ impl SkillClient {
             timeout: options.within,
             ..ClientConfig::new(&options.application_uri, &options.application_name)
         };
-        let client = Client::open(config, endpoint);
+        let (url, behind) = match endpoint.split_once(stations::BEHIND) {
+            Some((url, uri)) => (url, Some(uri.to_owned())),
+            None => (endpoint, None),
+        };
+        let client = Client::open(config, url);
         connected(&client, options).await?;
         Ok(Self {
             client,
             endpoint: endpoint.to_owned(),
+            behind,
         })
     }
 
@@ -119,6 +130,7 @@ impl SkillClient {
         Self {
             client: client.clone(),
             endpoint: endpoint.to_owned(),
+            behind: None,
         }
     }
 
@@ -128,9 +140,13 @@ impl SkillClient {
         &self.endpoint
     }
 
-    /// Returns the ApplicationUri of the server; empty while disconnected.
+    /// Returns the ApplicationUri of the server, or of the component behind it to which the client is
+    /// restricted; empty while disconnected.
     #[must_use]
     pub fn application_uri(&self) -> String {
+        if let Some(behind) = &self.behind {
+            return behind.clone();
+        }
         match &*self.client.link().borrow() {
             Link::Up {
                 application_uri, ..
@@ -155,7 +171,15 @@ impl SkillClient {
     /// # Errors
     /// No response.
     pub async fn programs(&self) -> Result<Vec<FoundSkill>, SkillFault> {
-        find::all_programs(&self.client).await
+        let found = find::all_programs(&self.client).await?;
+        Ok(self.of_component(found))
+    }
+
+    fn of_component(&self, mut found: Vec<FoundSkill>) -> Vec<FoundSkill> {
+        if self.behind.is_some() {
+            found.retain(|skill| skill.behind == self.behind);
+        }
+        found
     }
 
     /// Returns the skills of a type and its subtypes. A type of the earlier system
@@ -166,7 +190,16 @@ impl SkillClient {
     /// # Errors
     /// No response.
     pub async fn skills_of(&self, wanted: &TypeName) -> Result<Vec<FoundSkill>, SkillFault> {
-        find::skills(&self.client, wanted).await
+        let found = find::skills(&self.client, wanted).await?;
+        Ok(self.of_component(found))
+    }
+
+    /// Waits for changes of a station: the skills behind it come and go. `None` for other servers.
+    ///
+    /// # Errors
+    /// No response.
+    pub async fn station_changes(&self) -> Result<Option<StationChanges>, SkillFault> {
+        StationChanges::of(&self.client).await
     }
 
     /// Returns a handle to run a skill.
@@ -243,6 +276,12 @@ fn lost(error: &ClientError) -> SkillFault {
 
 fn called(error: &CallError, what: &str) -> SkillFault {
     match error {
+        // A station sent the call on, or the server gave it up: it is unknown whether it was
+        // executed.
+        CallError::Refused {
+            status: status @ (StatusCode::BadRequestInterrupted | StatusCode::BadTimeout),
+            ..
+        } => SkillFault::Lost(format!("{what}: {status}")),
         CallError::Refused { status, .. } => refused(*status, what),
         CallError::Client(error) => lost(error),
     }

@@ -32,8 +32,8 @@ pub mod yaml;
 pub use authority::{Authority, Owner};
 pub use client::{
     Chosen, ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, Mirror,
-    Mirrors, Needs, PeerAccess, RemoteState, SkillClient, SkillHandle, SkillStates, ToolState,
-    Watchable,
+    Mirrors, Needs, PeerAccess, RemoteState, SkillClient, SkillHandle, SkillStates, StationChanges,
+    ToolState, Watchable,
 };
 pub use component::{
     Asked, Change, ChangeKind, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers,

@@ -18,7 +18,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use opcua::types::{NamespaceMap, StatusCode, TypeLoader};
+use opcua::types::{DateTime, NamespaceMap, StatusCode, TypeLoader};
 use tokio::sync::watch;
 use trust::Fingerprint;
 
@@ -236,6 +236,14 @@ impl Client {
     #[must_use]
     pub fn link(&self) -> watch::Receiver<Link> {
         self.shared.link.subscribe()
+    }
+
+    /// Returns the start time of the connected server, which identifies its run; `None` while there
+    /// is no connection.
+    #[must_use]
+    pub fn started(&self) -> Option<DateTime> {
+        let connected = self.shared.connected().ok();
+        connected.map(|connected| connected.started)
     }
 
     /// Waits until the client is connected.

@@ -5,13 +5,13 @@ use std::time::Duration;
 use opcua::client::UARequest as _;
 use opcua::client::services::Call;
 use opcua::types::{
-    AttributeId, BrowseDescription, BrowseDirection, BrowsePath, BrowseResultMask, ByteString,
-    CallMethodRequest, DataValue, NodeClassMask, NodeId, QualifiedName, ReadValueId,
+    AttributeId, BrowseDescription, BrowseDirection, BrowsePath, BrowseResult, BrowseResultMask,
+    ByteString, CallMethodRequest, DataValue, NodeClassMask, NodeId, QualifiedName, ReadValueId,
     ReferenceDescription, ReferenceTypeId, RelativePath, RelativePathElement, StatusCode,
     TimestampsToReturn, Variant, WriteValue,
 };
 
-use super::supervisor::failed;
+use super::supervisor::{Connected, failed};
 use super::{Client, ClientError, Service};
 
 /// The references to follow.
@@ -49,6 +49,20 @@ impl Browse {
     pub fn inverse(mut self) -> Self {
         self.inverse = true;
         self
+    }
+
+    fn of_node(&self, node: &NodeId) -> BrowseDescription {
+        BrowseDescription {
+            node_id: node.clone(),
+            browse_direction: match self.inverse {
+                true => BrowseDirection::Inverse,
+                false => BrowseDirection::Forward,
+            },
+            reference_type_id: self.reference.clone(),
+            include_subtypes: self.subtypes,
+            node_class_mask: self.classes.bits(),
+            result_mask: BrowseResultMask::All as u32,
+        }
     }
 }
 
@@ -188,40 +202,42 @@ impl Client {
         node: &NodeId,
         what: Browse,
     ) -> Result<Vec<ReferenceDescription>, ClientError> {
-        let session = &self.shared.connected()?.session;
-        let description = BrowseDescription {
-            node_id: node.clone(),
-            browse_direction: if what.inverse {
-                BrowseDirection::Inverse
-            } else {
-                BrowseDirection::Forward
-            },
-            reference_type_id: what.reference,
-            include_subtypes: what.subtypes,
-            node_class_mask: what.classes.bits(),
-            result_mask: BrowseResultMask::All as u32,
-        };
-        let browsed = session.browse(&[description], 0, None).await;
-        let mut found = Vec::new();
-        let mut page = as_many(browsed, 1)?.pop();
-        while let Some(result) = page.take() {
-            if result.status_code.is_bad() {
-                return Err(ClientError::Status(result.status_code));
-            }
-            found.extend(result.references.into_iter().flatten());
-            let more: ByteString = result.continuation_point;
-            if more.is_null_or_empty() {
-                break;
-            }
-            let enough = found.len() >= MOST_REFERENCES;
-            let next = session.browse_next(enough, &[more]).await;
-            if enough {
-                break;
-            }
-            page = as_many(next, 1)?.pop();
+        let connected = self.shared.connected()?;
+        let description = what.of_node(node);
+        let browsed = connected.session.browse(&[description], 0, None).await;
+        let first = as_many(browsed, 1)?.pop().unwrap_or_default();
+        pages(&connected, first).await
+    }
+
+    /// Returns the references of several nodes, at most [`MOST_REFERENCES`] of each. A node that
+    /// does not exist has no references.
+    ///
+    /// # Errors
+    /// Returns an error if a request has no response.
+    pub async fn browse_all(
+        &self,
+        nodes: &[NodeId],
+        what: &Browse,
+    ) -> Result<Vec<Vec<ReferenceDescription>>, ClientError> {
+        let connected = self.shared.connected()?;
+        let descriptions: Vec<_> = nodes.iter().map(|node| what.of_node(node)).collect();
+        let mut parts = connected.limits.parts(Service::Browse, &descriptions);
+        while let Some(part) = parts.next_part() {
+            parts.answered(connected.session.browse(part, 0, None).await)?;
         }
-        found.truncate(MOST_REFERENCES);
-        Ok(found)
+        let mut all = Vec::with_capacity(nodes.len());
+        for (node, first) in nodes.iter().zip(parts.into_answers()) {
+            let found = match first.status_code {
+                // A server has a limited number of continuation points.
+                StatusCode::BadNoContinuationPoints => self.browse(node, what.clone()).await,
+                _ => pages(&connected, first).await,
+            };
+            all.push(match found {
+                Err(ClientError::Status(_)) => Vec::new(),
+                found => found?,
+            });
+        }
+        Ok(all)
     }
 
     /// Returns the node at a path of BrowseNames along hierarchical references.
@@ -341,6 +357,34 @@ impl Client {
             outputs: result.output_arguments.unwrap_or_default(),
         })
     }
+}
+
+/// Returns the references of the first page and of the pages that follow.
+async fn pages(
+    connected: &Connected,
+    first: BrowseResult,
+) -> Result<Vec<ReferenceDescription>, ClientError> {
+    let session = &connected.session;
+    let mut found = Vec::new();
+    let mut page = Some(first);
+    while let Some(result) = page.take() {
+        if result.status_code.is_bad() {
+            return Err(ClientError::Status(result.status_code));
+        }
+        found.extend(result.references.into_iter().flatten());
+        let more: ByteString = result.continuation_point;
+        if more.is_null_or_empty() {
+            break;
+        }
+        let enough = found.len() >= MOST_REFERENCES;
+        let next = session.browse_next(enough, &[more]).await;
+        if enough {
+            break;
+        }
+        page = as_many(next, 1)?.pop();
+    }
+    found.truncate(MOST_REFERENCES);
+    Ok(found)
 }
 
 /// Returns the results of a response if their number is as expected.

@@ -84,6 +84,8 @@ pub(crate) struct Connected {
     pub(crate) limits: OperationLimits,
     /// The number of connections so far, including this connection.
     pub(crate) connects: u64,
+    /// The start time of the server, which identifies its run.
+    pub(crate) started: DateTime,
     /// The cache of supertypes.
     pub(crate) supertypes: Mutex<HashMap<NodeId, Option<NodeId>>>,
     /// The event loop of the library, which sends and receives all messages.
@@ -389,6 +391,7 @@ async fn connect(
             namespaces,
             limits,
             connects,
+            started,
             supertypes: Mutex::default(),
             driving: driving.keep(),
         }),

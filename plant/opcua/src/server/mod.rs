@@ -4,11 +4,12 @@
 //! managers), `instances` (nodes from types), `methods` (methods without declaration in a type),
 //! `nodes` (values and writes), `calls` and `routed` (method calls), `overlay` (methods of the core
 //! namespace), `supplement` (attributes and values that the library does not serve), `roles`,
-//! `capabilities`, `sessions`, `events`.
+//! `capabilities`, `sessions`, `events`, `copies` (types and events of other servers).
 
 mod build;
 mod calls;
 mod capabilities;
+mod copies;
 mod events;
 mod instances;
 mod methods;
@@ -38,6 +39,7 @@ use tracing::{error, warn};
 pub use self::build::{Security, ServerBuilder, ServerConfig, ServerError};
 pub use self::calls::{MethodHandler, MethodRequest, Refusal, arguments_in, method};
 pub use self::capabilities::{Facets, capabilities, profiles};
+pub use self::copies::{ForwardedEvent, TypeSpec};
 pub use self::events::{StateRef, TransitionEvent};
 pub use self::instances::{
     IdRange, Instance, InstanceError, InstanceSpec, ObjectSpec, VariableSpec,

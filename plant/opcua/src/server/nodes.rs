@@ -12,13 +12,13 @@ use opcua::server::node_manager::{ParsedWriteValue, RequestContext, ServerContex
 use opcua::server::{CreateMonitoredItem, SubscriptionCache};
 use opcua::sync::RwLock;
 use opcua::types::{
-    Argument, AttributeId, DataEncoding, DataValue, DateTime, NodeId, NumericRange, ObjectTypeId,
-    ReferenceTypeId, StatusCode, TimestampsToReturn, Variant,
+    Argument, AttributeId, DataEncoding, DataValue, DateTime, NodeClass, NodeId, NumericRange,
+    ObjectTypeId, QualifiedName, ReferenceTypeId, StatusCode, TimestampsToReturn, Variant,
 };
 use tokio::time::{Instant, timeout_at};
 
 use super::calls::{self, fits};
-use super::sessions::{Caller, Sessions};
+use super::sessions::{Caller, Presence, Sessions};
 use super::view::View;
 use crate::limits::LONGEST_REQUEST;
 
@@ -31,6 +31,8 @@ pub struct WriteRequest {
     pub node: NodeId,
     /// The complete resulting value of the variable.
     pub value: DataValue,
+    /// Whether the session of the client is still active.
+    pub presence: Presence,
 }
 
 /// Decides on client writes to a variable. A decision that takes longer than [`LONGEST_REQUEST`] is
@@ -131,25 +133,58 @@ impl Spaces {
     /// Registers the inherited fields and the optional fields of event types for select clauses.
     /// The library registers only the fields that a type itself declares.
     pub(crate) fn inherit_event_fields(&self, types: &mut DefaultTypeTree) {
-        self.with(|view| {
+        let event_types = self.with(|view| {
             let base: NodeId = ObjectTypeId::BaseEventType.into();
-            let event_types: Vec<NodeId> = view.subtypes(&base).into_iter().cloned().collect();
+            let below = view.subtypes(&base).into_iter();
+            below.cloned().collect::<Vec<_>>()
+        });
+        self.event_fields(&event_types).register(types);
+    }
+
+    /// Returns the fields of event types, including inherited and optional fields.
+    pub(crate) fn event_fields(&self, event_types: &[NodeId]) -> EventFields {
+        self.with(|view| {
             let mut known = HashMap::new();
-            for event_type in &event_types {
+            let mut fields = Vec::new();
+            for event_type in event_types {
                 for (path, node) in view.event_fields(event_type, &mut known) {
                     if let Some(class) = view.class(&node) {
-                        let path: Vec<_> = path.iter().collect();
-                        types.add_type_property(&node, event_type, &path, class);
+                        fields.push(EventFieldOf {
+                            event_type: event_type.clone(),
+                            path,
+                            node,
+                            class,
+                        });
                     }
                 }
             }
-        });
+            EventFields(fields)
+        })
+    }
+}
+
+/// Fields of event types, to be registered without a lock of the address spaces.
+pub(crate) struct EventFields(Vec<EventFieldOf>);
+
+struct EventFieldOf {
+    event_type: NodeId,
+    path: Vec<QualifiedName>,
+    node: NodeId,
+    class: NodeClass,
+}
+
+impl EventFields {
+    pub(crate) fn register(&self, types: &mut DefaultTypeTree) {
+        for field in &self.0 {
+            let path: Vec<_> = field.path.iter().collect();
+            types.add_type_property(&field.node, &field.event_type, &path, field.class);
+        }
     }
 }
 
 /// The implementation of the node manager.
 pub(crate) struct Nodes {
-    namespaces: Vec<NamespaceMetadata>,
+    namespaces: RwLock<Vec<NamespaceMetadata>>,
     writers: RwLock<HashMap<NodeId, Arc<dyn WriteHandler>>>,
     sessions: Arc<Sessions>,
 }
@@ -157,7 +192,7 @@ pub(crate) struct Nodes {
 impl Nodes {
     pub(crate) fn new(namespaces: Vec<NamespaceMetadata>, sessions: Arc<Sessions>) -> Self {
         Self {
-            namespaces,
+            namespaces: RwLock::new(namespaces),
             writers: RwLock::default(),
             sessions,
         }
@@ -165,6 +200,18 @@ impl Nodes {
 
     pub(crate) fn on_write(&self, node: &NodeId, handler: Arc<dyn WriteHandler>) {
         self.writers.write().insert(node.clone(), handler);
+    }
+
+    /// Adds a namespace for BrowseNames to the NamespaceArray.
+    pub(crate) fn add_namespace(&self, uri: &str, index: u16) {
+        let mut namespaces = self.namespaces.write();
+        if !namespaces.iter().any(|one| one.namespace_index == index) {
+            namespaces.push(NamespaceMetadata {
+                namespace_uri: uri.to_owned(),
+                namespace_index: index,
+                ..NamespaceMetadata::default()
+            });
+        }
     }
 
     pub(crate) fn remove(&self, node: &NodeId) {
@@ -293,7 +340,7 @@ impl InMemoryNodeManagerImpl for Nodes {
     }
 
     fn namespaces(&self) -> Vec<NamespaceMetadata> {
-        self.namespaces.clone()
+        self.namespaces.read().clone()
     }
 
     async fn create_value_monitored_items(
@@ -345,6 +392,7 @@ impl InMemoryNodeManagerImpl for Nodes {
                     caller: self.sessions.caller(context),
                     node: node.clone(),
                     value: value.clone(),
+                    presence: Presence::of(context),
                 };
                 let decided = timeout_at(end, handler.write(request)).await;
                 if let Err(status) = decided.unwrap_or(Err(StatusCode::BadTimeout)) {

@@ -10,15 +10,15 @@ use tokio::task::JoinHandle;
 use tracing::debug;
 
 use super::find::FoundSkill;
-use super::{ClientOptions, SkillClient, SkillHandle};
+use super::{ClientOptions, SkillClient, SkillHandle, StationChanges};
 use crate::model::alias;
 use crate::parameters::TypeName;
 use crate::runs::SkillFault;
 use crate::skill::lock;
 
 /// An index of the skills of known servers. It reads the skills of each server and retries until
-/// the server responds. Clones share the index. It keeps no connection open: a caller that runs a
-/// skill connects with [`open`](Self::open).
+/// the server responds. Clones share the index. It keeps no connection open, except to stations, whose skills
+/// come and go: a caller that runs a skill connects with [`open`](Self::open).
 ///
 /// The discovery of servers reports them with [`seen`](Self::seen) and [`gone`](Self::gone).
 #[derive(Clone)]
@@ -46,9 +46,10 @@ struct Told {
 /// A skill and its server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Detected {
-    /// The ApplicationUri of the server.
+    /// The ApplicationUri of its component, which may be behind a station.
     pub application_uri: String,
-    /// The URL of the server.
+    /// The URL of the server. For a component behind a station it is the URL of the station, `#` and
+    /// the ApplicationUri of the component.
     pub endpoint: String,
     /// The skill.
     pub skill: FoundSkill,
@@ -123,8 +124,11 @@ impl Detector {
         let servers = lock(&self.shared.servers);
         let of = |told: &Told| {
             let detected = |skill: &FoundSkill| Detected {
-                application_uri: told.application_uri.clone(),
-                endpoint: told.endpoint.clone(),
+                application_uri: skill
+                    .behind
+                    .clone()
+                    .unwrap_or_else(|| told.application_uri.clone()),
+                endpoint: skill.endpoint(&told.endpoint),
                 skill: skill.clone(),
             };
             told.skills.iter().map(detected).collect::<Vec<_>>()
@@ -222,17 +226,32 @@ async fn look(shared: Arc<Shared>, server: String, endpoint: String) {
     drop(shared);
     loop {
         match ask(&endpoint, &options).await {
-            Ok((application_uri, skills)) => {
-                let Some(shared) = weak.upgrade() else { return };
+            Ok(Answer {
+                client,
+                changes,
+                skills,
+            }) => {
                 let told = Told {
-                    application_uri,
-                    endpoint,
+                    application_uri: client.application_uri(),
+                    endpoint: endpoint.clone(),
                     skills,
                 };
-                lock(&shared.faults).remove(&server);
-                lock(&shared.servers).insert(server, told);
-                shared.changed();
-                return;
+                if let Some(shared) = weak.upgrade() {
+                    lock(&shared.faults).remove(&server);
+                    lock(&shared.servers).insert(server.clone(), told);
+                    shared.changed();
+                }
+                let Some(mut changes) = changes else {
+                    client.close().await;
+                    return;
+                };
+                // The skills behind a station come and go.
+                tokio::select! {
+                    () = changes.next() => {}
+                    _why = client.lost() => {}
+                }
+                client.close().await;
+                again = AGAIN;
             }
             Err(fault) => {
                 debug!(endpoint, %fault, "cannot read the skills of a server");
@@ -245,15 +264,31 @@ async fn look(shared: Arc<Shared>, server: String, endpoint: String) {
     }
 }
 
-async fn ask(
-    endpoint: &str,
-    options: &ClientOptions,
-) -> Result<(String, Vec<FoundSkill>), SkillFault> {
+/// The skills of a server.
+struct Answer {
+    client: SkillClient,
+    /// The changes since the skills were read; `None` for a server that is no station.
+    changes: Option<StationChanges>,
+    skills: Vec<FoundSkill>,
+}
+
+async fn ask(endpoint: &str, options: &ClientOptions) -> Result<Answer, SkillFault> {
     let client = SkillClient::connect(endpoint, options).await?;
-    let found = client.skills().await;
-    let application_uri = client.application_uri();
-    client.close().await;
-    Ok((application_uri, found?))
+    let read = async {
+        let changes = client.station_changes().await?;
+        Ok((changes, client.skills().await?))
+    };
+    match read.await {
+        Ok((changes, skills)) => Ok(Answer {
+            client,
+            changes,
+            skills,
+        }),
+        Err(fault) => {
+            client.close().await;
+            Err(fault)
+        }
+    }
 }
 
 const AGAIN: Duration = Duration::from_millis(100);

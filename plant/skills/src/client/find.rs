@@ -28,6 +28,9 @@ use crate::workspace::Workspace;
 pub struct FoundSkill {
     /// The name of its component.
     pub component: String,
+    /// The ApplicationUri of the component behind a station; `None` for a skill of the server
+    /// itself.
+    pub behind: Option<String>,
     /// The number of the component in the space, if the server provides it.
     pub namespace: Option<u16>,
     /// The number of the skill in the component, from 1.
@@ -175,6 +178,8 @@ struct Shared {
     chains: HashMap<NodeId, Vec<FoundType>>,
     /// Name and number in the space of each component, by the NodeId of its object.
     components: HashMap<NodeId, (String, Option<u16>)>,
+    /// The ApplicationUris of the servers that a station shows, by the NodeIds of their objects.
+    behind: HashMap<NodeId, Option<String>>,
 }
 
 impl Shared {
@@ -186,12 +191,19 @@ impl Shared {
         let mut shared = Self {
             chains: HashMap::new(),
             components: HashMap::new(),
+            behind: HashMap::new(),
         };
         for instance in instances {
             let of = &instance.reference.type_definition.node_id;
             if !shared.chains.contains_key(of) {
                 let chain = chain(client, roots, of).await?;
                 shared.chains.insert(of.clone(), chain);
+            }
+            if let Some(node) = behind(&instance.above)
+                && !shared.behind.contains_key(node)
+            {
+                let uri = shown_uri(client, node).await?;
+                shared.behind.insert(node.clone(), uri);
             }
             if let Some((node, name)) = component_of(&instance.above)
                 && !shared.components.contains_key(node)
@@ -376,6 +388,7 @@ async fn read(
         .and_then(|id| u16::try_from(id / IDS_PER_SKILL).ok());
     Ok(FoundSkill {
         component,
+        behind: behind(&above).and_then(|node| shared.behind.get(node)?.clone()),
         namespace,
         number: number.filter(|number| *number > 0),
         name: name_of(&reference),
@@ -417,6 +430,32 @@ async fn tool_state(client: &Client, nodes: &Nodes) -> Result<Option<ToolState>,
     }))
 }
 
+/// Returns the object of the server to which a skill belongs, where a station shows the skills of
+/// other servers: the nearest object in a folder of a station.
+fn behind(above: &[(NodeId, String)]) -> Option<&NodeId> {
+    // Objects, then pairs of a folder and a server.
+    let pairs = above.get(1..)?.chunks_exact(2);
+    let shown = pairs.take_while(|pair| {
+        let mut folders = STATION_FOLDERS.iter();
+        pair.first()
+            .is_some_and(|(_, name)| folders.any(|folder| name == folder))
+    });
+    shown
+        .filter_map(|pair| pair.last())
+        .last()
+        .map(|(node, _)| node)
+}
+
+/// Reads the ApplicationUri of a server that a station shows.
+async fn shown_uri(client: &Client, node: &NodeId) -> Result<Option<String>, SkillFault> {
+    let path = [QualifiedName::new(1, "ApplicationUri")];
+    let Ok(property) = client.translate(node, &path).await else {
+        return Ok(None);
+    };
+    let value = value(client, &property).await?;
+    Ok(value.and_then(|value| value.as_str().map(str::to_owned)))
+}
+
 /// Returns the object above the folder Skills, and its name.
 fn component_of(above: &[(NodeId, String)]) -> Option<&(NodeId, String)> {
     above.iter().rev().find(|(_, name)| name != "Skills")
@@ -451,9 +490,16 @@ async fn chain(
     }
     let names = names(client, &ids).await?;
     let found = |(id, name): (&NodeId, Option<TypeName>)| {
+        let name = name?;
+        let identifier = id.identifier.to_string();
+        // A station shows a type under an identifier of its own, which contains that of the type.
+        let shown = format!("s=Types/{};", name.namespace);
         Some(FoundType {
-            name: name?,
-            identifier: id.identifier.to_string(),
+            identifier: match identifier.strip_prefix(&shown) {
+                Some(own) => own.to_owned(),
+                None => identifier,
+            },
+            name,
         })
     };
     let mut types: Vec<FoundType> = ids.iter().zip(names).filter_map(found).collect();
@@ -614,11 +660,13 @@ fn uri(client: &Client) -> String {
     client.namespaces().into_iter().nth(1).unwrap_or_default()
 }
 
+/// The folders in which a station shows the servers of the other level.
+pub(super) const STATION_FOLDERS: [&str; 2] = ["Devices", "Neighbours"];
 /// Number of identifiers per skill.
 const IDS_PER_SKILL: u32 = 100;
 /// Number of skills that are read concurrently; servers commonly accept more requests per session.
 const AT_ONCE: usize = 8;
-/// Maximum depth of the search for skills below Objects.
-const DEEPEST: usize = 8;
+/// Maximum depth of the search for skills below Objects. Each station adds two levels.
+const DEEPEST: usize = 20;
 /// Maximum number of objects that are searched.
 const MOST_OBJECTS: usize = 4_096;

@@ -65,8 +65,13 @@ impl SkillHandle {
             let said = value.value.as_ref()?;
             Some((state_in(said)?, value.source_timestamp.map(|at| at.ticks())))
         });
-        let (state, since) =
-            state.ok_or_else(|| self.unexpected("its state is none of a Program"))?;
+        let (state, since) = state.ok_or_else(|| match id.status() {
+            // A station between the client and the component has lost the component.
+            status @ (StatusCode::BadNoCommunication | StatusCode::BadNodeIdUnknown) => {
+                SkillFault::Lost(format!("{}: {status}", self.name()))
+            }
+            _ => self.unexpected("its state is none of a Program"),
+        })?;
         let state = RemoteState {
             state,
             run: run.value.as_ref().map_or(0, number),
@@ -237,7 +242,15 @@ impl SkillHandle {
             .client
             .call(&self.found.nodes.skill, node, vec![run.into()])
             .await
-            .map_err(|error| called(&error, &format!("ReadOutcome of {}", self.name())))?;
+            .map_err(|error| match &error {
+                // The station behind which the component is may reach it again.
+                CallError::Refused { status, .. } if *status == StatusCode::BadNoCommunication => {
+                    SkillFault::Lost(format!("{}: {status}", self.name()))
+                }
+                CallError::Refused { .. } | CallError::Client(_) => {
+                    called(&error, &format!("ReadOutcome of {}", self.name()))
+                }
+            })?;
         // Older components do not return `Unknown`.
         let [ended, succeeded, message, names, values, trace, more @ ..] = outputs.as_slice()
         else {
