@@ -7,6 +7,7 @@
 
 mod asking;
 pub mod definition;
+mod encoding;
 #[cfg(feature = "devices")]
 pub mod entry;
 mod exec;

@@ -10,17 +10,17 @@ use async_trait::async_trait;
 use bridge_node::{AskError, AskErrorKind, CallDescription, CallField, CallRole};
 use bytes::Bytes;
 use mappings::TopicId;
-use messages::Rank;
 use serde_json::Value as Json;
 use skills::{
     Asked, Builtin, Component, Driver, DriverSetup, Parameters, Results, Shape, SpaceWork, Stopped,
     Value, Work,
 };
 use tokio::time::sleep;
-use uadp::{BuiltinType, Fields};
+use uadp::Fields;
 
 use crate::asking::{Asking, Asks};
 use crate::definition::field_name;
+use crate::encoding::{NULL, block, bytes, encoded, no_time, nothing};
 use crate::fields;
 use crate::topics::Topics;
 
@@ -305,8 +305,7 @@ impl SpaceDriver {
     /// Sends a cancel request. Returns the code of `action_msgs/CancelGoal`, or `None` without an
     /// answer.
     async fn cancel(&self, action: &Action, id: [u8; 16]) -> Option<i64> {
-        let no_time = [&[DATE_TIME][..], &UNIX_EPOCH.to_le_bytes()].concat();
-        let request = Bytes::from(block(&[bytes(&id), no_time]));
+        let request = Bytes::from(block(&[bytes(&id), no_time()]));
         let answer = self.asks.ask(action.cancel, request, CANCEL_WITHIN).await;
         let answer = read(&answer.ok()?, &action.cancels.response).ok()?;
         let (_, code) = answer.first()?;
@@ -353,7 +352,10 @@ impl SpaceDriver {
                 None => of_its_name(),
             };
             written.push(match value {
-                Some(value) => encoded(taken, &value).map_err(|why| format!("{name}: {why}"))?,
+                Some(value) => {
+                    let (_, namespace, _) = self.topic.triple();
+                    encoded(taken, &value, namespace).map_err(|why| format!("{name}: {why}"))?
+                }
                 None if taken.optional => vec![NULL],
                 None => nothing(taken)
                     .ok_or_else(|| format!("{name}: nothing is said of it, and it must be set"))?,
@@ -535,111 +537,6 @@ fn camel(name: &str) -> String {
     spelled
 }
 
-/// Encodes a value as a Variant of the type of a field.
-fn encoded(field: &CallField, value: &Json) -> Result<Vec<u8>, String> {
-    let none = || format!("a {:?} cannot be said in a component", field.builtin);
-    let builtin = Builtin::of_id(u32::from(field.builtin as u8)).ok_or_else(none)?;
-    let array = field.rank != Rank::Scalar;
-    let shape = Shape { builtin, array };
-    let value = match value.as_array() {
-        Some(elements) => elements
-            .iter()
-            .map(|element| typed(builtin, element))
-            .collect(),
-        None => typed(builtin, value),
-    };
-    let value = shape.read_json(&value)?;
-    if let (
-        Rank::Array {
-            fixed: Some(length),
-        },
-        Value::Array(_, elements),
-    ) = (field.rank, &value)
-        && u32::try_from(elements.len()) != Ok(length)
-    {
-        return Err(format!(
-            "it has {length} values, and {} are given",
-            elements.len()
-        ));
-    }
-    let one = fields::block(&[value]);
-    Ok(one.get(2..).unwrap_or_default().to_vec())
-}
-
-/// Converts a constant, or a number without a fraction, into JSON of that type.
-fn typed(builtin: Builtin, value: &Json) -> Json {
-    let whole = |text: &str| serde_json::from_str::<Json>(text).ok();
-    match (builtin, value) {
-        (Builtin::String, _) => value.clone(),
-        (_, Json::String(text)) => whole(text).unwrap_or_else(|| value.clone()),
-        (Builtin::Double | Builtin::Float, _) => value.clone(),
-        (_, Json::Number(number)) => match number.as_f64() {
-            Some(float) if number.is_f64() && float.fract() == 0.0 => {
-                whole(&format!("{float:.0}")).unwrap_or_else(|| value.clone())
-            }
-            Some(_) | None => value.clone(),
-        },
-        (_, Json::Bool(_) | Json::Null | Json::Array(_) | Json::Object(_)) => value.clone(),
-    }
-}
-
-/// Returns the default value of a ROS message field, or `None` for a field that is a message.
-fn nothing(field: &CallField) -> Option<Vec<u8>> {
-    let width = match field.builtin {
-        BuiltinType::Boolean | BuiltinType::SByte | BuiltinType::Byte => 1,
-        BuiltinType::Int16 | BuiltinType::UInt16 => 2,
-        BuiltinType::Int32
-        | BuiltinType::UInt32
-        | BuiltinType::Float
-        // The length of the text.
-        | BuiltinType::String
-        | BuiltinType::ByteString => 4,
-        BuiltinType::Int64
-        | BuiltinType::UInt64
-        | BuiltinType::Double
-        | BuiltinType::DateTime => 8,
-        BuiltinType::Guid
-        | BuiltinType::XmlElement
-        | BuiltinType::NodeId
-        | BuiltinType::ExpandedNodeId
-        | BuiltinType::StatusCode
-        | BuiltinType::QualifiedName
-        | BuiltinType::LocalizedText
-        | BuiltinType::ExtensionObject
-        | BuiltinType::DataValue
-        | BuiltinType::Variant
-        | BuiltinType::DiagnosticInfo => 0,
-    };
-    let one = match field.builtin == BuiltinType::DateTime {
-        true => UNIX_EPOCH.to_le_bytes().to_vec(),
-        false => vec![0; width],
-    };
-    let id = field.builtin as u8;
-    match field.rank {
-        Rank::Scalar if width == 0 => None,
-        Rank::Scalar => Some([vec![id], one].concat()),
-        Rank::Array { fixed: Some(_) } if width == 0 => None,
-        Rank::Array { fixed } => {
-            let count = fixed.unwrap_or_default();
-            let length = i32::try_from(count).ok()?.to_le_bytes().to_vec();
-            let elements = one.repeat(usize::try_from(count).ok()?);
-            Some([vec![id | ARRAY], length, elements].concat())
-        }
-    }
-}
-
-/// Encodes a ByteString as a Variant.
-fn bytes(of: &[u8; 16]) -> Vec<u8> {
-    [&[BYTE_STRING][..], &16_i32.to_le_bytes(), of].concat()
-}
-
-/// Encodes a block of Variants.
-fn block(variants: &[Vec<u8>]) -> Vec<u8> {
-    // A call has a few thousand fields at most.
-    let count = u16::try_from(variants.len()).unwrap_or(u16::MAX);
-    [count.to_le_bytes().to_vec(), variants.concat()].concat()
-}
-
 fn new_id() -> [u8; 16] {
     let mut id = [0; 16];
     for place in id.chunks_exact_mut(8) {
@@ -671,19 +568,13 @@ const RETURNS: Duration = Duration::from_secs(3);
 const PAUSE: Duration = Duration::from_millis(200);
 /// ERROR_REJECTED of `action_msgs/CancelGoal`.
 const REJECTED: i64 = 1;
-/// EncodingMasks of OPC 10000-6, 5.2.2.16.
-const NULL: u8 = 0;
-const ARRAY: u8 = 0x80;
-const BYTE_STRING: u8 = 15;
-const DATE_TIME: u8 = 13;
-/// 1970 as a DateTime, which stands for no time in ROS messages.
-const UNIX_EPOCH: i64 = 116_444_736_000_000_000;
 
 #[cfg(test)]
 mod tests {
     use std::path::Path;
 
     use skills::model;
+    use uadp::BuiltinType;
 
     use super::*;
 
@@ -816,7 +707,7 @@ mod tests {
 
     #[test]
     fn the_examples_are_read_and_served() {
-        for name in ["niryo-ned.yaml", "turtlebot3.yaml"] {
+        for name in ["niryo-ned.yaml", "turtlebot3.yaml", "moveit-arm.yaml"] {
             let component = example(name);
             let mut asking = Asking::new();
             let made = with_drivers(&component, &mut asking, &mut Topics::default());

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use serde_json::Value as Json;
 
+use crate::frame::of_angles;
 use crate::parameters::{Parameters, shortened};
 use crate::yaml::{Code, Kind, Node, Reader};
 
@@ -48,6 +49,10 @@ pub enum Source {
     Parameter(Part),
     /// A field of the response.
     Field(Part),
+    /// A list, as the elements of an array of messages.
+    List(Vec<Self>),
+    /// A message, by its fields.
+    Message(Vec<(String, Self)>),
 }
 
 /// A value or a part of a value.
@@ -70,6 +75,8 @@ pub enum Form {
     QuaternionZ,
     /// The w of that quaternion.
     QuaternionW,
+    /// An element of the quaternion w, x, y, z of a pose of six numbers.
+    Orientation(usize),
 }
 
 impl Part {
@@ -91,6 +98,15 @@ impl Part {
             Form::Plain => Ok(value),
             Form::QuaternionZ => Ok(half()?.sin().into()),
             Form::QuaternionW => Ok(half()?.cos().into()),
+            Form::Orientation(element) => {
+                let numbers = value.as_array().into_iter().flatten();
+                let numbers: Option<Vec<f64>> = numbers.map(Json::as_f64).collect();
+                let pose: Option<[f64; 6]> = numbers.and_then(|all| all.try_into().ok());
+                let [_, _, _, a, b, c] =
+                    pose.ok_or_else(|| format!("{} is no pose of six numbers", self.name))?;
+                let quaternion = of_angles([a, b, c]);
+                Ok(quaternion.get(element).copied().unwrap_or_default().into())
+            }
         }
     }
 }
@@ -115,6 +131,17 @@ impl Source {
                 Some(value) => part.of(value),
                 None => Err(format!("the answer has no field {}", part.name)),
             },
+            Self::List(sources) => {
+                let values = sources.iter().map(|one| one.value(parameters, answer));
+                values.collect::<Result<Vec<_>, _>>().map(Json::Array)
+            }
+            Self::Message(fields) => {
+                let fields = fields
+                    .iter()
+                    .map(|(name, one)| Ok((name.clone(), one.value(parameters, answer)?)));
+                let fields: Result<serde_json::Map<_, _>, String> = fields.collect();
+                fields.map(Json::Object)
+            }
         }
     }
 }
@@ -238,6 +265,14 @@ fn entries<T>(
 fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<Source> {
     match &node.kind {
         Kind::Scalar(text) => return Some(Source::Constant(text.as_str().into())),
+        Kind::List(nodes) if nodes.iter().any(|node| matches!(node.kind, Kind::Map(_))) => {
+            // All elements are read, so that all of their faults are found.
+            let sources: Vec<Option<Source>> = nodes
+                .iter()
+                .map(|node| read_element(node, of_answer, reader))
+                .collect();
+            return sources.into_iter().collect::<Option<_>>().map(Source::List);
+        }
         Kind::List(nodes) => {
             let texts = nodes.iter().map(|node| reader.text(node, "a single value"));
             let texts: Option<Vec<&str>> = texts.collect();
@@ -257,12 +292,16 @@ fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<
             Some(at)
         }
     };
-    let form = match form.map(|node| reader.text(node, "quaternion_z or quaternion_w")) {
+    let form = match form.map(|node| reader.text(node, FORMS)) {
         None => Form::Plain,
         Some(Some("quaternion_z")) => Form::QuaternionZ,
         Some(Some("quaternion_w")) => Form::QuaternionW,
+        Some(Some("orientation_w")) => Form::Orientation(0),
+        Some(Some("orientation_x")) => Form::Orientation(1),
+        Some(Some("orientation_y")) => Form::Orientation(2),
+        Some(Some("orientation_z")) => Form::Orientation(3),
         Some(_) => {
-            reader.wrong(node, "`as: quaternion_z` or `as: quaternion_w`");
+            reader.wrong(node, FORMS);
             return None;
         }
     };
@@ -284,6 +323,27 @@ fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<
     }
 }
 
+/// Reads an element of a list of messages, or a field of a message: a message, unless it has the
+/// keys of a source.
+fn read_element(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<Source> {
+    let Kind::Map(pairs) = &node.kind else {
+        return read_source(node, of_answer, reader);
+    };
+    let is_source = pairs.iter().any(|(key, _)| {
+        matches!(&key.kind, Kind::Scalar(key) if matches!(key.as_str(), "parameter" | "field"))
+    });
+    if is_source {
+        return read_source(node, of_answer, reader);
+    }
+    let fields = entries(Some(node), reader, |node, reader| {
+        read_element(node, of_answer, reader)
+    });
+    Some(Source::Message(fields))
+}
+
+/// The values of the key `as`.
+const FORMS: &str = "quaternion_z or quaternion_w of a heading, or orientation_x, orientation_y, \
+     orientation_z or orientation_w of a pose";
 /// Default time limit, the same as for other callers of the space.
 const USUALLY_WITHIN: Duration = Duration::from_secs(10);
 /// Default `halt_timeout`.
@@ -366,6 +426,60 @@ mod tests {
         let answer = |name: &str| (name == "code").then(|| 7.into());
         assert_eq!(code.value(&parameters, &answer), Ok(7.into()));
         assert_eq!(work.succeeds, [("status".to_owned(), "1".to_owned())]);
+    }
+
+    #[test]
+    fn a_list_of_maps_is_an_array_of_messages_with_parts_of_parameters() {
+        let work = driver(
+            "{action: {name: ua_2_2_70, goal: {constraints: [{link: tip, region: {sizes: [0.1], \
+             points: [{x: {parameter: Goal, at: 1}}, {}]}}, {weight: 1}]}}}",
+        )
+        .unwrap();
+        let goal = ("Goal".to_owned(), crate::Value::from(vec![1.0, 2.0, 3.0]));
+        let declared = crate::model::find("NavigateToSkillType")
+            .unwrap()
+            .parameters();
+        let parameters = Parameters::complete(&declared, vec![goal]).unwrap();
+        let (name, source) = &work.request[0];
+        assert_eq!(name, "constraints");
+        assert_eq!(
+            source.value(&parameters, &|_| None),
+            Ok(serde_json::json!([
+                {"link": "tip", "region": {"sizes": ["0.1"], "points": [{"x": 2.0}, {}]}},
+                {"weight": "1"}
+            ]))
+        );
+        let wrong = driver("{action: {name: ua_2_2_70, goal: {a: [{x: {parameter: [1]}}]}}}");
+        assert!(wrong.is_err(), "{wrong:?}");
+    }
+
+    #[test]
+    fn an_orientation_is_that_of_a_pose_of_six_numbers() {
+        let source = |text: &str| {
+            let work = driver(&format!(
+                "{{action: {{name: ua_2_2_70, goal: {{x: {{parameter: Goal, as: {text}}}}}}}}}"
+            ));
+            work.unwrap().request.remove(0).1
+        };
+        let quarter = std::f64::consts::FRAC_PI_2;
+        let pose = serde_json::json!([0.1, 0.2, 0.3, quarter, 0.0, 0.0]);
+        for (name, expected) in [
+            ("w", 0.5_f64.sqrt()),
+            ("x", 0.5_f64.sqrt()),
+            ("y", 0.0),
+            ("z", 0.0),
+        ] {
+            let Source::Parameter(part) = source(&format!("orientation_{name}")) else {
+                panic!("{name}")
+            };
+            let value = part.of(pose.clone()).unwrap().as_f64().unwrap();
+            assert!((value - expected).abs() < 1e-12, "{name}: {value}");
+        }
+        let Source::Parameter(part) = source("orientation_x") else {
+            panic!("no parameter")
+        };
+        let heading = part.of(serde_json::json!([1.0, 2.0, 3.0])).unwrap_err();
+        assert_eq!(heading, "Goal is no pose of six numbers");
     }
 
     #[test]
