@@ -6,7 +6,7 @@ mod table;
 mod types;
 mod units;
 
-pub use nodeset::nodeset;
+pub use nodeset::{DomainNodeSet, domain_nodesets, nodeset};
 pub use table::{Preset, SkillType, Unit, Variable};
 pub use types::TYPES;
 

@@ -1,10 +1,13 @@
 //! The table as a NodeSet2 document (OPC 10000-6, annex F).
 
+mod domains;
 mod methods;
 
 use std::fmt::Write as _;
 
 use program::{Method, Rest};
+
+pub use self::domains::{DomainNodeSet, domain_nodesets};
 
 use super::table::{SkillType, Unit, Variable};
 use super::types::TYPES;
