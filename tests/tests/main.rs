@@ -29,7 +29,6 @@ mod loop_silence;
 mod mes;
 mod metadata;
 mod modules;
-mod moveit;
 mod mqtt;
 mod niryo;
 mod page;

@@ -36,14 +36,14 @@ fn calls(robot: &Child, service: &str) -> Vec<Value> {
         .collect()
 }
 
-pub(crate) struct Line {
-    pub(crate) side: UaSide,
-    pub(crate) robot: Child,
+struct Line {
+    side: UaSide,
+    robot: Child,
     bridge: Child,
     _master: Child,
 }
 
-pub(crate) fn start(cell: &Cell) -> Line {
+fn start(cell: &Cell) -> Line {
     start_with(cell, MAPPING)
 }
 
@@ -65,7 +65,7 @@ fn bridge(cell: &Cell, mapping: &str) -> Child {
         .start()
 }
 
-pub(crate) fn cell() -> Option<Cell> {
+fn cell() -> Option<Cell> {
     let _there = definitions()?;
     Cell::with(&[Peer::Ros1])
 }
