@@ -8,7 +8,7 @@ use std::sync::Arc;
 use bridge_core::Local;
 use bridge_node::{
     Arguments, Carried, Context, Failure, FailureKind, KeyService, Program, Rank,
-    RedundancyArguments,
+    RedundancyArguments, SharedProgram,
 };
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser};
 use mappings::{Mapping, SpaceId};
@@ -24,6 +24,15 @@ use crate::{PortOptions, Ros1Port};
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     bridge_node::run::<BridgeRos1>(arguments)
+}
+
+/// Returns `bridge-ros1` for a process with several programs. `arguments` begin with the name of the
+/// program.
+///
+/// # Errors
+/// The exit code if the arguments are invalid or ask for help; the message was printed.
+pub fn shared(arguments: Vec<OsString>) -> Result<SharedProgram, ExitCode> {
+    SharedProgram::new::<BridgeRos1>(arguments)
 }
 
 /// The command line: the arguments of clap, and the ROS arguments.

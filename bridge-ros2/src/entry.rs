@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::fmt::Display;
-use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
+use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -11,7 +11,7 @@ use std::sync::Arc;
 use bridge_core::Local;
 use bridge_node::{
     Arguments, Carried, Context, Failure, FailureKind, KeyService, Program, Rank,
-    RedundancyArguments,
+    RedundancyArguments, SharedProgram,
 };
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
@@ -31,6 +31,15 @@ use crate::{PortOptions, Ros2Port, RosArgs, environment, limits};
 #[must_use]
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     bridge_node::run::<BridgeRos2>(arguments)
+}
+
+/// Returns `bridge-ros2` for a process with several programs. `arguments` begin with the name of the
+/// program.
+///
+/// # Errors
+/// The exit code if the arguments are invalid or ask for help; the message was printed.
+pub fn shared(arguments: Vec<OsString>) -> Result<SharedProgram, ExitCode> {
+    SharedProgram::new::<BridgeRos2>(arguments)
 }
 
 /// Carries topics between a ROS 2 domain and the space of OPC UA PubSub.
@@ -188,7 +197,7 @@ fn number(text: &str, range: RangeInclusive<u16>) -> Result<Option<u16>, String>
 }
 
 /// Returns the addresses of the hosts from the command line, or else from the environment.
-fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, Failure> {
+async fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, Failure> {
     let listed = variable.unwrap_or_default().split(';');
     let hosts: Vec<&str> = if given.is_empty() {
         listed
@@ -198,19 +207,24 @@ fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, Failur
     } else {
         given.iter().map(String::as_str).collect()
     };
-    hosts.into_iter().map(address).collect()
+    let mut addresses = Vec::with_capacity(hosts.len());
+    for host in hosts {
+        addresses.push(address(host).await?);
+    }
+    Ok(addresses)
 }
 
-/// Returns the address of a host; RustDDS supports IPv4 only.
-fn address(host: &str) -> Result<IpAddr, Failure> {
+/// Returns the address of a host; RustDDS supports IPv4 only. The other programs of the thread go on
+/// while a name is resolved.
+async fn address(host: &str) -> Result<IpAddr, Failure> {
     if let Ok(IpAddr::V6(_)) = host.parse() {
         let message = format!("peer {host}: only IPv4 addresses can be reached");
         return Err(Failure::new(FailureKind::Usage, message));
     }
     let unknown =
         |why: &dyn Display| Failure::new(FailureKind::Unavailable, format!("peer {host}: {why}"));
-    let mut addresses = (host, 0)
-        .to_socket_addrs()
+    let mut addresses = tokio::net::lookup_host((host, 0))
+        .await
         .map_err(|error| unknown(&error))?;
     addresses
         .find(SocketAddr::is_ipv4)
@@ -221,7 +235,7 @@ fn address(host: &str) -> Result<IpAddr, Failure> {
 impl Program for BridgeRos2 {
     type Port = Ros2Port;
 
-    const NAME: &'static str = "bridge-ros2";
+    const NAME: &'static str = NAME;
     // Keys are fetched over OPC UA, and this program logs the outcome.
     const QUIET: &'static str = plant_keys::QUIET;
     const LOCAL: Local = Local::Cdr;
@@ -277,7 +291,8 @@ impl Program for BridgeRos2 {
                 peers: peers(
                     &self.ros_peer,
                     std::env::var("ROS_STATIC_PEERS").ok().as_deref(),
-                )?,
+                )
+                .await?,
                 node: self.node()?,
                 enclave: security.enclave().cloned(),
             },
@@ -422,6 +437,8 @@ fn gid_length(text: &str) -> Result<GidChoice, &'static str> {
 /// The first number that is proposed for the space of another domain. Lower numbers are kept for
 /// domains of the same number.
 const FIRST_FREE: u16 = 40;
+/// The name of the program.
+pub(crate) const NAME: &str = "bridge-ros2";
 /// The name of the bridge in `ros2 node list`.
 const NODE_NAME: &str = "ua_bridge_ros2";
 

@@ -214,7 +214,7 @@ impl Node {
             return;
         };
         let rosout = Arc::new(Rosout::new(self.shared.clock.clone(), thread.clone()));
-        bridge_node::hear_log(&rosout);
+        bridge_node::hear_log(crate::entry::NAME, &rosout);
         *lock(&self.shared.services) = Some((services, rosout));
         thread.unpark();
     }

@@ -16,6 +16,8 @@ pub const METRICS_ROS1: &str = "127.0.0.1:9101";
 pub const METRICS_ROS2: &str = "127.0.0.1:9102";
 /// The metrics address of a cell's ua-server.
 pub const METRICS_SERVER: &str = "127.0.0.1:9103";
+/// The metrics address of a cell's ua-cell.
+pub const METRICS_CELL: &str = "127.0.0.1:9107";
 /// The endpoint of a cell's ua-server.
 pub const SERVER_ENDPOINT: &str = "opc.tcp://127.0.0.1:4840";
 
@@ -43,6 +45,17 @@ impl Cell {
         self.with_ros1(Started::new("bridge-ros1", &program("bridge-ros1")))
             .args(args)
             .args(["--interface", "lo", "--metrics", metrics])
+    }
+
+    /// Returns several programs in one process, with bridge-ros2 in domain 2, not started yet. `args`
+    /// follow the arguments that every cell needs.
+    #[must_use]
+    pub fn ua_cell_started(&self, args: &[&str]) -> Started {
+        self.with_ros1(Started::new("ua-cell", &program("ua-cell")))
+            .env("ROS_DOMAIN_ID", "2")
+            .env("UA_PKI", self.folder().join("pki"))
+            .args(args)
+            .args(["--interface", "lo", "--metrics", METRICS_CELL])
     }
 
     /// Starts the example of tcpros that republishes the first topic of each pair as the second

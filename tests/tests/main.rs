@@ -31,6 +31,7 @@ mod metadata;
 mod modules;
 mod mqtt;
 mod niryo;
+mod one_process;
 mod page;
 mod peers;
 mod plug_and_produce;

@@ -102,7 +102,7 @@ enum Format {
 struct Wanted {
     formats: Vec<Format>,
     machine: Machine,
-    /// A program that was built elsewhere, with the feature `bridges`.
+    /// An `ua-bridge` that was built elsewhere.
     program: Option<PathBuf>,
 }
 
@@ -327,7 +327,7 @@ fn pages(
     let [bridge, _] = links::BRIDGES;
     ensure!(
         output(&folder, &[bridge, "--version"])?.starts_with(bridge),
-        "{} has no bridges: build it with `--features ua-bridge/bridges`",
+        "{} does not act as the bridges: give an `ua-bridge`",
         program.display()
     );
     let all = Help::all(&folder)?;

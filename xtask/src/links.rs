@@ -13,7 +13,8 @@ use anyhow::Context as _;
 /// The target of the links.
 pub(crate) const TARGET: &str = "ua-bridge";
 /// The names of the links.
-pub(crate) const NAMES: [&str; 7] = [
+pub(crate) const NAMES: [&str; 8] = [
+    "ua-cell",
     "ua-component",
     "ua-gds",
     "ua-lds",
@@ -23,7 +24,7 @@ pub(crate) const NAMES: [&str; 7] = [
     "ua-station",
 ];
 
-/// The bridges, which are programs of their own and, in packages, names of `ua-bridge`.
+/// The bridges, which are programs of their own, and names of `ua-bridge` in packages.
 pub(crate) const BRIDGES: [&str; 2] = ["bridge-ros1", "bridge-ros2"];
 
 /// Creates the links in a folder with `ua-bridge`. A file with the name of a link is replaced. Each
@@ -35,7 +36,7 @@ pub(crate) fn make(folder: &Path) -> anyhow::Result<()> {
     make_named(folder, &NAMES)
 }
 
-/// Creates the links in a folder whose `ua-bridge` has the bridges, too.
+/// Creates the links in a folder without the programs of the bridges, for which there are links, too.
 ///
 /// # Errors
 /// Returns an error if the folder cannot be written.

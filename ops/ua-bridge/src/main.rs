@@ -1,9 +1,10 @@
-//! `ua-bridge`: the programs of the plant in one file, in packages also the two bridges.
+//! `ua-bridge`: the programs of the plant and the two bridges in one file.
 //!
 //! The program acts as `ua-server`, `ua-component` and so on. It chooses by the name under which it
 //! is called, which a link sets, or by its first argument: `ua-bridge server` is `ua-server`.
 
 mod called;
+mod cell;
 
 use std::env;
 use std::ffi::OsString;
@@ -22,13 +23,11 @@ struct Program {
 
 /// All programs. The first argument of `ua-bridge` is a name without `ua-`.
 const PROGRAMS: &[Program] = &[
-    #[cfg(feature = "bridges")]
     Program {
         name: "bridge-ros1",
         about: "carries topics between a ROS 1 graph and the space",
         run: bridge_ros1::entry::run,
     },
-    #[cfg(feature = "bridges")]
     Program {
         name: "bridge-ros2",
         about: "carries topics between a ROS 2 domain and the space",
@@ -38,6 +37,11 @@ const PROGRAMS: &[Program] = &[
         name: "ua-server",
         about: "the OPC UA server of the cell",
         run: ua_server::run,
+    },
+    Program {
+        name: "ua-cell",
+        about: "both bridges and the server of a small cell in one process",
+        run: cell::run,
     },
     Program {
         name: "ua-component",

@@ -71,7 +71,7 @@ use std::sync::{Arc, OnceLock};
 
 use bridge_node::{
     Arguments, Context, Failure, FailureKind, KeyService, NodeSetReader, Observer, Owned, Program,
-    Site,
+    SharedProgram, Site,
 };
 use discovery::scan::Range;
 use discovery::{AnnounceSettings, Interface};
@@ -137,6 +137,18 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     }
 }
 
+/// Returns `ua-server` for a process with several programs. `arguments` begin with the name of the
+/// program.
+///
+/// # Errors
+/// The exit code if the arguments are invalid or ask for help; the message was printed.
+pub fn shared(arguments: Vec<OsString>) -> Result<SharedProgram, ExitCode> {
+    SharedProgram::new::<UaServer>(arguments)
+}
+
+/// The reader of the NodeSet2 files that a mapping names.
+pub const NODESETS: NodeSetReader = plant_nodesets::read;
+
 impl UaServer {
     fn pki_root(&self) -> PathBuf {
         let usual = || pki::default_root(|name| std::env::var(name).ok());
@@ -191,7 +203,7 @@ impl Program for UaServer {
     const QUIET: &'static str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
         opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
 
-    const NODESETS: Option<NodeSetReader> = Some(plant_nodesets::read);
+    const NODESETS: Option<NodeSetReader> = Some(NODESETS);
 
     fn library() -> Option<&'static str> {
         Some(plant_opcua::patches::library())

@@ -4,7 +4,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use broker::{Identity, Mqtt};
 use mappings::{Broker, BrokerAddress, Mapping, PubSub, SpaceId};
-use transport::{Carrier, Options, Udp};
+use transport::{Carrier, Options, ProcessHub, Udp};
 
 use crate::arguments::Arguments;
 use crate::exit::{Failure, FailureKind};
@@ -12,11 +12,12 @@ use crate::exit::{Failure, FailureKind};
 /// The source of own messages for a carrier that does not return them. No sender has this address.
 pub(crate) const NO_SOURCE: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 
-/// Opens the carrier of a space. Returns the options of its socket too, if it uses UDP.
+/// Opens the carrier of a space, which is connected with the other carriers of the process by `hub`.
+/// Returns the options of its socket too, if it uses UDP.
 pub(crate) fn open(
     (program, own): (&str, SpaceId),
     (arguments, mapping): (&Arguments, &Mapping),
-    several: bool,
+    (several, hub): (bool, Option<&ProcessHub>),
 ) -> Result<(Box<dyn Carrier>, Option<Options>), Failure> {
     let url = arguments.flags.address.as_deref();
     if let Some(broker) = broker_of(url, mapping.pubsub())? {
@@ -31,7 +32,11 @@ pub(crate) fn open(
     let options = options(arguments, mapping, several)?;
     let udp = Udp::open(&options)
         .map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
-    Ok((Box::new(udp), Some(options)))
+    let carrier: Box<dyn Carrier> = match hub {
+        Some(hub) => hub.connect(udp, &options),
+        None => Box::new(udp),
+    };
+    Ok((carrier, Some(options)))
 }
 
 /// Returns the broker of the command line, else that of the mapping. The address of the command

@@ -9,9 +9,11 @@ use std::io::{self, IsTerminal, Write};
 use std::sync::{Arc, PoisonError, RwLock, Weak};
 
 use tracing::field::{Field, Visit};
-use tracing::{Event, Level, Subscriber};
+use tracing::span::{Attributes, Id};
+use tracing::{Event, Level, Span, Subscriber, error_span};
 use tracing_subscriber::filter::{FilterExt as _, LevelFilter};
 use tracing_subscriber::layer::{Context, SubscriberExt as _};
+use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{EnvFilter, Layer};
 
@@ -138,34 +140,80 @@ pub trait LogSink: Send + Sync + 'static {
     fn hear(&self, record: LogRecord);
 }
 
-/// Registers `sink` for every warning and error of our own crates while it is alive. Messages of
-/// libraries are excluded, because a sink that uses a library would receive messages about its own
-/// work.
-pub fn hear_log(sink: &Arc<impl LogSink>) {
+/// Registers `sink` for every warning and error of our own crates while it is alive, except those of
+/// other programs of the process than `program`. Messages of libraries are excluded, because a sink
+/// that uses a library would receive messages about its own work.
+pub fn hear_log(program: &'static str, sink: &Arc<impl LogSink>) {
     let sink: Arc<dyn LogSink> = Arc::clone(sink) as _;
     let mut sinks = SINKS.write().unwrap_or_else(PoisonError::into_inner);
-    sinks.retain(|sink| sink.strong_count() > 0);
-    sinks.push(Arc::downgrade(&sink));
+    sinks.retain(|listed| listed.sink.strong_count() > 0);
+    sinks.push(ListedSink {
+        program,
+        sink: Arc::downgrade(&sink),
+    });
 }
 
-static SINKS: RwLock<Vec<Weak<dyn LogSink>>> = RwLock::new(Vec::new());
+/// A registered sink.
+struct ListedSink {
+    program: &'static str,
+    sink: Weak<dyn LogSink>,
+}
+
+static SINKS: RwLock<Vec<ListedSink>> = RwLock::new(Vec::new());
+
+/// Returns the span of a program that shares its process with others. Events within the span are
+/// those of the program.
+pub(crate) fn program_span(program: &'static str) -> Span {
+    // The level of the least filter, so that each message has its program.
+    error_span!(PROGRAM, name = program)
+}
+
+/// The name of the spans of programs.
+const PROGRAM: &str = "program";
+
+/// The program of a span.
+struct ProgramName(String);
+
+impl Visit for ProgramName {
+    fn record_str(&mut self, field: &Field, value: &str) {
+        if field.name() == "name" {
+            value.clone_into(&mut self.0);
+        }
+    }
+
+    fn record_debug(&mut self, _: &Field, _: &dyn std::fmt::Debug) {}
+}
 
 /// The layer that forwards warnings and errors to the sinks.
 #[derive(Debug)]
 struct Warnings;
 
-impl<S: Subscriber> Layer<S> for Warnings {
-    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Warnings {
+    fn on_new_span(&self, attributes: &Attributes<'_>, id: &Id, context: Context<'_, S>) {
+        if attributes.metadata().name() == PROGRAM
+            && let Some(span) = context.span(id)
+        {
+            let mut name = ProgramName(String::new());
+            attributes.record(&mut name);
+            span.extensions_mut().insert(name);
+        }
+    }
+
+    fn on_event(&self, event: &Event<'_>, context: Context<'_, S>) {
         let metadata = event.metadata();
         let ours = OURS.iter().any(|ours| metadata.target().starts_with(ours));
         if *metadata.level() > Level::WARN || !ours {
             return;
         }
+        let mut spans = context.event_scope(event).into_iter().flatten();
+        let program =
+            spans.find_map(|span| Some(span.extensions().get::<ProgramName>()?.0.clone()));
         let sinks: Vec<Arc<dyn LogSink>> = SINKS
             .read()
             .unwrap_or_else(PoisonError::into_inner)
             .iter()
-            .filter_map(Weak::upgrade)
+            .filter(|listed| program.as_ref().is_none_or(|name| listed.program == name))
+            .filter_map(|listed| listed.sink.upgrade())
             .collect();
         if sinks.is_empty() {
             return;
@@ -292,19 +340,22 @@ mod tests {
     #[test]
     fn a_sink_hears_the_warnings_of_the_program_with_their_fields() {
         let heard = Arc::new(Heard::default());
-        hear_log(&heard);
+        hear_log("bridge-ros2", &heard);
         let subscriber = tracing_subscriber::registry().with(Warnings);
         let ours = || tracing::warn!(topic = "rt/a", size = 7, "too large");
         let ordinary = || tracing::info!("ordinary");
         let foreign = || tracing::error!(target: "rustdds::network", "of a library");
         let forged = || tracing::warn!(reason = %"a\nb", "forged\nline");
-        let all: [&dyn Fn(); 4] = [&ours, &ordinary, &foreign, &forged];
+        let of_other = || program_span("bridge-ros1").in_scope(ours);
+        let of_own = || program_span("bridge-ros2").in_scope(|| tracing::warn!("own"));
+        let all: [&dyn Fn(); 6] = [&ours, &ordinary, &foreign, &of_other, &forged, &of_own];
         tracing::subscriber::with_default(subscriber, || all.iter().for_each(|log| log()));
         assert_eq!(
             *heard.0.lock().unwrap(),
             [
                 "WARN too large topic=rt/a size=7",
-                r"WARN forged\nline reason=a\nb"
+                r"WARN forged\nline reason=a\nb",
+                "WARN own",
             ]
         );
     }

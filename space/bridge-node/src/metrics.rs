@@ -1,11 +1,14 @@
 //! The HTTP pages with counters, delays and readiness.
 
+mod parts;
+
 use std::collections::VecDeque;
 use std::convert::Infallible;
+use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -20,6 +23,8 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
 use tracing::{debug, info};
 
+pub(crate) use self::parts::{Ask, RunLoops, loops};
+use self::parts::{PageAnswers, PageParts, ShownPart};
 use crate::clock;
 use crate::exit::{Failure, FailureKind};
 use crate::tap::{TapRequest, Taps};
@@ -89,8 +94,6 @@ pub fn full(bytes: impl Into<Bytes>) -> PageBody {
     Full::new(bytes.into()).boxed_unsync()
 }
 
-/// The run loops that answer requests, in the order of their spaces.
-type Ask<T> = Arc<[mpsc::Sender<oneshot::Sender<T>>]>;
 /// The receiver of a run loop: each request carries the sender for its response.
 pub type Requests<T> = mpsc::Receiver<oneshot::Sender<T>>;
 
@@ -104,60 +107,138 @@ pub(crate) fn never<T>() -> Requests<T> {
 /// # Errors
 /// The address cannot be bound.
 pub async fn serve_pages<T: Told>(address: Option<SocketAddr>) -> Result<Requests<T>, Failure> {
-    let requests = serve(address, 1, (None, None)).await?.pop();
-    Ok(requests.unwrap_or_else(never))
+    let pages = Pages::alone("", None);
+    let RunLoops { asks, mut requests } = loops(1);
+    pages.run("", asks);
+    pages.listen(address).await?;
+    Ok(requests.pop().unwrap_or_else(never))
 }
 
-/// Listens at `address` and returns the receivers of requests for `loops` run loops. Without an
-/// address there are no requests. Further paths are answered by `site`; `taps` are the tapped
-/// topics of the run loops.
-pub(crate) async fn serve<T: Told>(
-    address: Option<SocketAddr>,
-    loops: usize,
-    (site, taps): (Option<Arc<dyn Site>>, Option<Arc<Taps>>),
-) -> Result<Vec<Requests<T>>, Failure> {
-    let (ask, mut requests): (Vec<_>, Vec<_>) = (0..loops).map(|_| mpsc::channel(4)).unzip();
-    // The caller pops from the end; responses have to be in the order of the spaces.
-    requests.reverse();
-    let Some(address) = address else {
-        return Ok(requests);
-    };
-    let listener = TcpListener::bind(address).await.map_err(|error| {
-        Failure::new(
-            FailureKind::Unavailable,
-            format!("cannot serve metrics at {address}: {error}; give another --metrics address"),
-        )
-    })?;
-    let at = listener.local_addr().unwrap_or(address);
-    info!(
-        "metrics at http://{at}/metrics, status at http://{at}/status, readiness at http://{at}/readyz"
-    );
-    let ask: Ask<T> = ask.into();
-    if let Some(site) = &site {
-        info!("{}", site.describe(at));
-        let asked = Arc::clone(&ask);
-        site.start(Arc::new(move || {
-            let ask = Arc::clone(&asked);
-            Box::pin(async move { statuses(&ask).await.iter().map(T::json).collect() })
-        }));
+/// The pages of the programs of a process.
+pub(crate) struct Pages<T> {
+    parts: PageParts<T>,
+    /// Answers further paths.
+    site: Arc<RwLock<Option<Arc<dyn Site>>>>,
+    /// The tapped topics of the run loops.
+    taps: Option<Arc<Taps>>,
+    /// The address of the pages, while they are served.
+    at: OnceLock<SocketAddr>,
+    /// Whether the pages outlive their programs, which may be started again.
+    is_cell: bool,
+}
+
+impl<T> fmt::Debug for Pages<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Pages")
+            .field("parts", &self.parts)
+            .field("at", &self.at)
+            .finish_non_exhaustive()
     }
-    drop(tokio::spawn(accept(listener, Served { ask, site, taps })));
-    Ok(requests)
+}
+
+impl<T: Told> Pages<T> {
+    /// Returns the pages of a program that does not run yet. They end with its run loops.
+    pub(crate) fn alone(program: &'static str, taps: Option<Arc<Taps>>) -> Self {
+        Self {
+            parts: PageParts::new(&[program]),
+            site: Arc::default(),
+            taps,
+            at: OnceLock::new(),
+            is_cell: false,
+        }
+    }
+
+    /// Returns the pages of programs that do not run yet, and that may be started again.
+    pub(crate) fn of_cell(programs: &[&'static str], taps: Arc<Taps>) -> Self {
+        Self {
+            parts: PageParts::new(programs),
+            is_cell: true,
+            ..Self::alone("", Some(taps))
+        }
+    }
+
+    /// Notes that a program runs with these run loops.
+    pub(crate) fn run(&self, program: &str, asks: Vec<Ask<T>>) {
+        self.parts.run(program, asks);
+    }
+
+    /// Notes that a program does not run, for this reason.
+    pub(crate) fn down(&self, program: &str, why: String) {
+        self.parts.down(program, why);
+    }
+
+    /// Listens at `address`. Without an address there are no requests.
+    ///
+    /// # Errors
+    /// The address cannot be bound.
+    pub(crate) async fn listen(&self, address: Option<SocketAddr>) -> Result<(), Failure> {
+        let Some(address) = address else {
+            return Ok(());
+        };
+        let listener = TcpListener::bind(address).await.map_err(|error| {
+            Failure::new(
+                FailureKind::Unavailable,
+                format!(
+                    "cannot serve metrics at {address}: {error}; give another --metrics address"
+                ),
+            )
+        })?;
+        let at = listener.local_addr().unwrap_or(address);
+        info!(
+            "metrics at http://{at}/metrics, status at http://{at}/status, readiness at http://{at}/readyz"
+        );
+        // The pages listen once.
+        let _first = self.at.set(at);
+        let served = Served {
+            parts: self.parts.clone(),
+            site: Arc::clone(&self.site),
+            taps: self.taps.clone(),
+            is_cell: self.is_cell,
+        };
+        drop(tokio::spawn(accept(listener, served)));
+        Ok(())
+    }
+
+    /// Lets a site answer further paths, if the pages are served.
+    pub(crate) fn show(&self, site: Arc<dyn Site>) {
+        let Some(at) = self.at.get() else {
+            return;
+        };
+        info!("{}", site.describe(*at));
+        let parts = self.parts.clone();
+        site.start(Arc::new(move || {
+            let parts = parts.clone();
+            Box::pin(async move {
+                let shown = parts.answers().await.shown;
+                shown.iter().map(ShownPart::json).collect()
+            })
+        }));
+        *self.site.write().unwrap_or_else(PoisonError::into_inner) = Some(site);
+    }
 }
 
 /// The sources of the pages.
 struct Served<T> {
-    ask: Ask<T>,
-    site: Option<Arc<dyn Site>>,
+    parts: PageParts<T>,
+    site: Arc<RwLock<Option<Arc<dyn Site>>>>,
     taps: Option<Arc<Taps>>,
+    is_cell: bool,
+}
+
+impl<T> Served<T> {
+    fn site(&self) -> Option<Arc<dyn Site>> {
+        let site = self.site.read();
+        site.unwrap_or_else(PoisonError::into_inner).clone()
+    }
 }
 
 impl<T> Clone for Served<T> {
     fn clone(&self) -> Self {
         Self {
-            ask: Arc::clone(&self.ask),
-            site: self.site.clone(),
+            parts: self.parts.clone(),
+            site: Arc::clone(&self.site),
             taps: self.taps.clone(),
+            is_cell: self.is_cell,
         }
     }
 }
@@ -175,7 +256,7 @@ async fn accept<T: Told>(listener: TcpListener, served: Served<T>) {
                     continue;
                 }
             },
-            () = all_closed(&served.ask) => return,
+            () = served.parts.all_closed(), if !served.is_cell => return,
         };
         let served = served.clone();
         let visit = Visit {
@@ -252,12 +333,6 @@ impl Crowd {
     }
 }
 
-async fn all_closed<T>(ask: &Ask<T>) {
-    for ask in ask.iter() {
-        ask.closed().await;
-    }
-}
-
 async fn answer<T: Told>(stream: TcpStream, served: Served<T>, visit: Visit) {
     let service = service_fn(|request| {
         let (served, visit) = (served.clone(), visit.clone());
@@ -274,29 +349,15 @@ async fn answer<T: Told>(stream: TcpStream, served: Served<T>, visit: Visit) {
     }
 }
 
-/// Returns the status of each run loop.
-async fn statuses<T>(ask: &Ask<T>) -> Vec<T> {
-    let mut all = Vec::with_capacity(ask.len());
-    for ask in ask.iter() {
-        let (reply, status) = oneshot::channel();
-        if ask.send(reply).await.is_ok()
-            && let Ok(status) = status.await
-        {
-            all.push(status);
-        }
-    }
-    all
-}
-
 async fn page<T: Told>(
     request: Request<Incoming>,
-    Served { ask, site, taps }: Served<T>,
+    served: Served<T>,
     visit: Visit,
 ) -> Response<PageBody> {
     let page = match request.uri().path() {
         "/tap" => {
-            return match taps {
-                Some(taps) => tapped(&request, visit.peer, (&ask, &taps)).await,
+            return match &served.taps {
+                Some(taps) => tapped(&request, visit.peer, (&served.parts, taps)).await,
                 None => text(
                     StatusCode::NOT_FOUND,
                     "this program passes on no values\n".into(),
@@ -307,7 +368,7 @@ async fn page<T: Told>(
         "/status" => Page::Status,
         "/readyz" => Page::Ready,
         _ => {
-            return match site {
+            return match served.site() {
                 Some(site) => site.answer(request, visit).await,
                 None => text(
                     StatusCode::NOT_FOUND,
@@ -316,33 +377,33 @@ async fn page<T: Told>(
             };
         }
     };
-    let all = statuses(&ask).await;
-    if all.is_empty() || (page == Page::Ready && all.len() < ask.len()) {
+    let PageAnswers { shown, expected } = served.parts.answers().await;
+    if shown.is_empty() || (page == Page::Ready && shown.len() < expected) {
         let ending = "the program is stopping\n".to_owned();
         return text(StatusCode::SERVICE_UNAVAILABLE, ending);
     }
     match page {
         Page::Metrics => text(
             StatusCode::OK,
-            all.iter().map(T::prometheus).collect::<String>(),
+            shown.iter().map(ShownPart::prometheus).collect::<String>(),
         ),
         Page::Ready => {
             let clock = clock::fault(clock::now().utc).map(|fault| format!("{fault}\n"));
             let reasons: String = clock
                 .into_iter()
-                .chain(all.iter().flat_map(T::not_ready))
+                .chain(shown.iter().flat_map(ShownPart::not_ready))
                 .collect();
-            let waiting: String = all.iter().flat_map(T::waiting_for).collect();
+            let waiting: String = shown.iter().flat_map(ShownPart::waiting_for).collect();
             if reasons.is_empty() {
                 text(StatusCode::OK, format!("ready\n{waiting}"))
             } else {
                 text(StatusCode::SERVICE_UNAVAILABLE, reasons + &waiting)
             }
         }
-        Page::Status => match all.as_slice() {
-            [only] if ask.len() == 1 => text(StatusCode::OK, only.json()),
+        Page::Status => match shown.as_slice() {
+            [only] if expected == 1 => text(StatusCode::OK, only.json()),
             all => {
-                let each: Vec<String> = all.iter().map(T::json).collect();
+                let each: Vec<String> = all.iter().map(ShownPart::json).collect();
                 text(StatusCode::OK, format!("[{}]", each.join(",")))
             }
         },
@@ -354,7 +415,7 @@ async fn page<T: Told>(
 async fn tapped<T: Told>(
     request: &Request<Incoming>,
     peer: SocketAddr,
-    (ask, taps): (&Ask<T>, &Taps),
+    (parts, taps): (&PageParts<T>, &Taps),
 ) -> Response<PageBody> {
     if !peer.ip().to_canonical().is_loopback() {
         let why = "topics are tapped from this host only\n".to_owned();
@@ -368,7 +429,7 @@ async fn tapped<T: Told>(
         Some(answer) => {
             if answer.is_new {
                 // Each run loop wakes up, and records events before the response is sent.
-                let _statuses = statuses(ask).await;
+                let _answers = parts.answers().await;
             }
             text(StatusCode::OK, answer.json)
         }
@@ -414,16 +475,13 @@ mod tests {
     /// Serves pages without run loops. Returns the address, and the receiver that keeps the server
     /// running.
     async fn served() -> (SocketAddr, Requests<Status>) {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let address = listener.local_addr().unwrap();
-        let (ask, requests) = mpsc::channel(1);
-        let served = Served {
-            ask: [ask].into(),
-            site: None,
-            taps: None,
-        };
-        tokio::spawn(accept(listener, served));
-        (address, requests)
+        let pages = Pages::alone("", None);
+        let RunLoops { asks, mut requests } = loops(1);
+        pages.run("", asks);
+        let requests = requests.pop().unwrap();
+        let any = "127.0.0.1:0".parse().unwrap();
+        pages.listen(Some(any)).await.unwrap();
+        (*pages.at.get().unwrap(), requests)
     }
 
     async fn connect(from: &str, to: SocketAddr) -> TcpStream {

@@ -26,10 +26,11 @@ use crate::carrier;
 use crate::clock::now;
 use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
+use crate::host::ProcessHost;
 use crate::keys::{KeyRing, KeyService};
 use crate::logging;
 use crate::mapping_file::{ConfigurationFile, MappingFile, NodeSetReader, Running};
-use crate::metrics::{self, Requests, Site};
+use crate::metrics::{self, Requests, RunLoops, Site};
 use crate::observer::Observer;
 use crate::port::Port;
 use crate::redundancy;
@@ -39,7 +40,6 @@ use crate::service;
 use crate::service_manager;
 use crate::signals;
 use crate::status::Status;
-use crate::tap::Taps;
 
 /// The parts of a program, for [`run`].
 pub trait Program: Parser {
@@ -186,25 +186,7 @@ pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCod
     };
     logging::start(program.arguments().flags.log, P::QUIET);
     descriptors::raise();
-    let arguments = program.arguments();
-    let mapping = arguments.mapping.as_deref();
-    let mut refused = None;
-    let spaces = |mapping: &Mapping| {
-        let spaces = program.spaces(mapping)?;
-        refused = check_redundancy(&program, mapping, &spaces).err();
-        Ok(spaces)
-    };
-    let mapping = match program.made() {
-        Ok(Some(Made::Run(made))) => Ok(Some(MappingFile::made(made, program.configuration()))),
-        Ok(Some(Made::Checked)) => Ok(None),
-        Ok(None) => MappingFile::open((mapping, P::NODESETS), arguments.check, spaces),
-        Err(failure) => Err(failure),
-    };
-    let mapping = match refused {
-        Some(failure) => Err(failure),
-        None => mapping,
-    };
-    let ended = match mapping {
+    let ended = match open(&program) {
         Ok(Some(mapping)) => serve(program, mapping),
         Ok(None) => Ok(()),
         Err(failure) => Err(failure),
@@ -216,6 +198,31 @@ pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCod
             failure.kind().into()
         }
     })
+}
+
+/// Returns the mapping of a program; `None` if the mapping was only to be checked, and can run.
+///
+/// # Errors
+/// The mapping cannot be read or cannot run, or contradicts the arguments.
+pub(crate) fn open<P: Program>(program: &P) -> Result<Option<MappingFile>, Failure> {
+    let arguments = program.arguments();
+    let mapping = arguments.mapping.as_deref();
+    let mut refused = None;
+    let spaces = |mapping: &Mapping| {
+        let spaces = program.spaces(mapping)?;
+        refused = check_redundancy(program, mapping, &spaces).err();
+        Ok(spaces)
+    };
+    let mapping = match program.made() {
+        Ok(Some(Made::Run(made))) => Ok(Some(MappingFile::made(made, program.configuration()))),
+        Ok(Some(Made::Checked)) => Ok(None),
+        Ok(None) => MappingFile::open((mapping, P::NODESETS), arguments.check, spaces),
+        Err(failure) => Err(failure),
+    };
+    match refused {
+        Some(failure) => Err(failure),
+        None => mapping,
+    }
 }
 
 /// Checks that a redundant program can carry the mapping.
@@ -237,56 +244,70 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         .enable_all()
         .build()
         .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
+    let host = ProcessHost::alone(P::NAME);
     let ended = runtime.block_on(async move {
-        let arguments = program.arguments();
-        let running = file.running().clone();
-        let spaces = program.spaces(&running.mapping)?;
-        check_redundancy(&program, &running.mapping, &spaces)?;
         let signal = signals::stopped()?;
-        let hangup = signals::listen(SignalKind::hangup())?;
-        let (switch, switches) = watch::channel(0);
-        let switching = signals::switches(program.rank().is_some(), switch)?;
-        let (changed, changes) = watch::channel(running);
         service_manager::start_watchdog();
-        let taps = Arc::<Taps>::default();
-        let pages = (program.site()?, Some(Arc::clone(&taps)));
-        let mut requests = metrics::serve(arguments.flags.metrics, spaces.len(), pages).await?;
-        let several = spaces.len() > 1;
-        let (stopping, stop) = watch::channel(false);
-        let mut shells = JoinSet::new();
-        for own in spaces.iter().copied() {
-            // The span names the space of a log line, which matters only with several spaces.
-            let span = if several {
-                info_span!("bridge", space = %own)
-            } else {
-                Span::none()
-            };
-            let requests = requests.pop().unwrap_or_else(metrics::never);
-            let pages = (requests, &taps);
-            let shell = prepare(&program, (&changes, &switches), (own, several), pages);
-            let shell = shell.instrument(span.clone());
-            let ended = shell.await?.run(told(stop.clone()));
-            // Run as separate tasks: waking the future given to `block_on` costs a system call each
-            // time.
-            shells.spawn(ended.instrument(span));
-        }
-        service_manager::ready();
-        let mut ended = Ok(());
-        tokio::select! {
-            () = signal => {}
-            first = shells.join_next() => ended = how(first),
-            () = file.follow(hangup, changed) => {}
-            () = switching => {}
-        }
-        service_manager::ending();
-        stopping.send_replace(true);
-        while let Some(next) = shells.join_next().await {
-            ended = ended.and(how(Some(next)));
-        }
-        ended
+        carry(&program, file, (&host, signal)).await
     });
     // A poll of files on a disk that does not answer is not awaited.
     runtime.shutdown_background();
+    ended
+}
+
+/// Runs a program until `stop` completes.
+///
+/// # Errors
+/// The reason why the program cannot run or has ended.
+pub(crate) async fn carry<P: Program>(
+    program: &P,
+    file: MappingFile,
+    (host, stop): (&ProcessHost, impl Future<Output = ()>),
+) -> Result<(), Failure> {
+    let arguments = program.arguments();
+    let running = file.running().clone();
+    let spaces = program.spaces(&running.mapping)?;
+    check_redundancy(program, &running.mapping, &spaces)?;
+    let hangup = signals::listen(SignalKind::hangup())?;
+    let (switch, switches) = watch::channel(0);
+    let switching = signals::switches(program.rank().is_some(), switch)?;
+    let (changed, changes) = watch::channel(running);
+    let site = program.site()?;
+    let RunLoops { asks, mut requests } = metrics::loops(spaces.len());
+    host.starting(P::NAME, (&asks, site.as_ref()), arguments.flags.metrics)
+        .await?;
+    let several = spaces.len() > 1;
+    let (stopping, stopped) = watch::channel(false);
+    let mut shells = JoinSet::new();
+    for own in spaces.iter().copied() {
+        // The span names the space of a log line, which matters only with several spaces.
+        let span = if several {
+            info_span!("bridge", space = %own)
+        } else {
+            Span::none()
+        };
+        let requests = requests.pop().unwrap_or_else(metrics::never);
+        let changes = (&changes, &switches);
+        let shell = prepare(program, changes, (own, several), (requests, host));
+        let shell = shell.instrument(span.clone());
+        let ended = shell.await?.run(told(stopped.clone()));
+        // Run as separate tasks: waking the future given to `block_on` costs a system call each
+        // time.
+        shells.spawn(ended.instrument(span).in_current_span());
+    }
+    host.started(P::NAME, (asks, site));
+    let mut ended = Ok(());
+    tokio::select! {
+        () = stop => {}
+        first = shells.join_next() => ended = how(first),
+        () = file.follow(hangup, changed) => {}
+        () = switching => {}
+    }
+    host.ending();
+    stopping.send_replace(true);
+    while let Some(next) = shells.join_next().await {
+        ended = ended.and(how(Some(next)));
+    }
     ended
 }
 
@@ -295,7 +316,7 @@ async fn prepare<P: Program>(
     program: &P,
     (changes, switches): (&watch::Receiver<Running>, &watch::Receiver<u64>),
     (own, several): (SpaceId, bool),
-    (requests, taps): (Requests<Status>, &Arc<Taps>),
+    (requests, host): (Requests<Status>, &ProcessHost),
 ) -> Result<Shell<P::Port>, Failure> {
     let arguments = program.arguments();
     let Running {
@@ -304,7 +325,8 @@ async fn prepare<P: Program>(
         about,
     } = changes.borrow().clone();
     log_start::<P>(arguments, own, about.hash());
-    let (carrier, group) = carrier::open((P::NAME, own), (arguments, &mapping), several)?;
+    let hub = host.hub(several);
+    let (carrier, group) = carrier::open((P::NAME, own), (arguments, &mapping), (several, hub))?;
     let settings = Settings {
         own,
         local: P::LOCAL,
@@ -352,7 +374,7 @@ async fn prepare<P: Program>(
         owned: P::owned,
         claims: P::CLAIMS,
         requests,
-        taps: Arc::clone(taps),
+        taps: Arc::clone(host.taps()),
         changes: changes.clone(),
         switches: switches.clone(),
         keys,

@@ -331,6 +331,11 @@ impl<P: Port> Shell<P> {
                 info!(%interface, "the PubSub network is within reach again: sending and receiving");
             }
         }
+        let late = self.carrier.overflowed();
+        if late > 0 {
+            let why = "messages of another program of this process were not received in time";
+            self.router.dropped(Reason::Overflow, late, why);
+        }
         // A broker may have another limit after each connection.
         self.router.set_relay(relay(self.carrier.as_ref()));
     }

@@ -10,6 +10,8 @@ use std::os::linux::net::SocketAddrExt as _;
 use std::os::unix::ffi::OsStrExt as _;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::process;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use tokio::time::{MissedTickBehavior, interval};
@@ -35,6 +37,11 @@ pub(crate) fn ending() {
 /// Sends keep-alives while the runtime makes progress, if the service manager asks for them. A run
 /// loop that hangs stops them, because it uses the only thread.
 pub(crate) fn start_watchdog() {
+    watch_over(Vec::new());
+}
+
+/// As [`start_watchdog`], while the threads of all pulses make progress, too.
+pub(crate) fn watch_over(mut pulses: Vec<Pulse>) {
     let variable = |name: &str| env::var_os(name);
     let Some(period) = watchdog_period(variable, process::id()) else {
         return;
@@ -45,10 +52,53 @@ pub(crate) fn start_watchdog() {
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             ticks.tick().await;
-            // The next keep-alive follows before the deadline.
-            let _sent = manager.send("WATCHDOG=1");
+            // Every pulse is read, so that each counts from this keep-alive on.
+            let beating = pulses
+                .iter_mut()
+                .map(Pulse::has_beaten)
+                .filter(|beaten| *beaten)
+                .count();
+            if beating == pulses.len() {
+                // The next keep-alive follows before the deadline.
+                let _sent = manager.send("WATCHDOG=1");
+            }
         }
     });
+}
+
+/// Shows that a thread makes progress.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Pulse {
+    beats: Arc<AtomicU64>,
+    /// The number of beats that were read.
+    seen: u64,
+}
+
+impl Pulse {
+    /// Beats while the current runtime makes progress, several times between two keep-alives.
+    pub(crate) fn start(&self) {
+        let variable = |name: &str| env::var_os(name);
+        let Some(period) = watchdog_period(variable, process::id()) else {
+            return;
+        };
+        let beats = Arc::clone(&self.beats);
+        tokio::spawn(async move {
+            let mut ticks = interval(period / 4);
+            ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+            loop {
+                ticks.tick().await;
+                beats.fetch_add(1, Ordering::Relaxed);
+            }
+        });
+    }
+
+    /// Returns whether the thread has made progress since the last call.
+    fn has_beaten(&mut self) -> bool {
+        let beats = self.beats.load(Ordering::Relaxed);
+        let is_new = beats != self.seen;
+        self.seen = beats;
+        is_new
+    }
 }
 
 /// Returns the interval of keep-alives: half of the deadline of the service manager.
@@ -161,6 +211,15 @@ mod tests {
         let sent = (0..100_000).map(|_| manager.send("WATCHDOG=1"));
         let refused = sent.into_iter().find_map(Result::err).unwrap();
         assert_eq!(refused.kind(), io::ErrorKind::WouldBlock);
+    }
+
+    #[test]
+    fn a_thread_that_hangs_has_no_pulse() {
+        let mut pulse = Pulse::default();
+        assert!(!pulse.has_beaten());
+        pulse.beats.fetch_add(3, Ordering::Relaxed);
+        assert!(pulse.has_beaten());
+        assert!(!pulse.has_beaten());
     }
 
     #[test]

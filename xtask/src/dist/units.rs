@@ -22,7 +22,7 @@ enum Kind {
     Template,
 }
 
-const UNITS: [Unit; 8] = [
+const UNITS: [Unit; 9] = [
     Unit {
         program: "bridge-ros1",
         about: "ROS 1 graph",
@@ -43,6 +43,14 @@ const UNITS: [Unit; 8] = [
         program: "ua-server",
         about: "OPC UA server of the cell",
         environment: &["UA_METRICS=127.0.0.1:9103"],
+        needs: None,
+        reloads: true,
+        kind: Kind::Single,
+    },
+    Unit {
+        program: "ua-cell",
+        about: "both bridges and the server of a small cell",
+        environment: &["UA_METRICS=127.0.0.1:9107"],
         needs: None,
         reloads: true,
         kind: Kind::Single,

@@ -5,8 +5,11 @@ use std::process::Command;
 use crate::program::{Ended, named};
 
 /// The name of each program, and the first argument of `ua-bridge` for the program.
-const NAMES: [(&str, &str); 7] = [
+const NAMES: [(&str, &str); 10] = [
+    ("bridge-ros1", "bridge-ros1"),
+    ("bridge-ros2", "bridge-ros2"),
     ("ua-server", "server"),
+    ("ua-cell", "cell"),
     ("ua-component", "component"),
     ("ua-lds", "lds"),
     ("ua-gds", "gds"),

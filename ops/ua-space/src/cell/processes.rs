@@ -224,10 +224,11 @@ fn address(text: &str) -> Option<SocketAddr> {
 }
 
 /// The programs with a part in a cell.
-const PROGRAMS: [&str; 8] = [
+const PROGRAMS: [&str; 9] = [
     "bridge-ros1",
     "bridge-ros2",
     "ua-server",
+    "ua-cell",
     "ua-component",
     "ua-lds",
     "ua-gds",
@@ -251,6 +252,7 @@ mod tests {
             Some("bridge-ros1")
         );
         assert_eq!(of("ua-bridge server").as_deref(), Some("ua-server"));
+        assert_eq!(of("ua-bridge cell cell.yaml").as_deref(), Some("ua-cell"));
         assert_eq!(of("ua-bridge space list"), None);
         assert_eq!(of("/bin/bash"), None);
     }

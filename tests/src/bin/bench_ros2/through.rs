@@ -49,7 +49,7 @@ pub(crate) struct Ways {
     from_ros2: Pacer,
     in_ros1: Listener,
     relay: Child,
-    bridges: [Child; 2],
+    bridges: Vec<Child>,
 }
 
 impl Ways {
@@ -59,12 +59,26 @@ impl Ways {
         Self::secured(cell, waiting, "")
     }
 
+    /// As [`stand`](Self::stand), with both bridges in one process.
+    pub(crate) fn in_one_process(cell: &Cell, waiting: u32) -> Self {
+        Self::with(cell, &mapping(waiting), |mapping| {
+            let only = ["--only", "bridge-ros1,bridge-ros2"];
+            let together = cell.ua_cell_started(&[&[mapping][..], &only].concat());
+            vec![together.start()]
+        })
+    }
+
     /// Starts all programs, with `security` added to the mapping of both bridges.
     pub(crate) fn secured(cell: &Cell, waiting: u32, security: &str) -> Self {
-        let mapping = MAPPING.replace("WAITING", &waiting.to_string()) + security;
-        let mapping = cell.file("through.yaml", &mapping);
-        let mapping = mapping.to_string_lossy();
-        let bridges = [cell.bridge_ros1(&[&mapping]), cell.bridge_ros2(&[&mapping])];
+        Self::with(cell, &(mapping(waiting) + security), |mapping| {
+            vec![cell.bridge_ros1(&[mapping]), cell.bridge_ros2(&[mapping])]
+        })
+    }
+
+    /// Starts all programs; `start` starts the bridges with the mapping of this text.
+    fn with(cell: &Cell, mapping: &str, start: impl FnOnce(&str) -> Vec<Child>) -> Self {
+        let mapping = cell.file("through.yaml", mapping);
+        let bridges = start(&mapping.to_string_lossy());
         let relay = cell.topic_tools_relay("/relay_in", "/relay_out");
         let node = BareNode::start("/bench");
         let mut inputs = node
@@ -135,10 +149,9 @@ impl Ways {
         })
     }
 
-    /// Returns both bridges, first the bridge of ROS 1.
-    pub(crate) const fn bridges(&self) -> [&Child; 2] {
-        let [ros1, ros2] = &self.bridges;
-        [ros1, ros2]
+    /// Returns the processes of both bridges, first the bridge of ROS 1.
+    pub(crate) fn bridges(&self) -> &[Child] {
+        &self.bridges
     }
 
     pub(crate) fn used(&self, way: usize) -> Duration {
@@ -171,6 +184,10 @@ variables:
   - {node: ns=2;i=10, name: there, type: String, origin: 1, queue: {drop_oldest: WAITING}}
   - {node: ns=2;i=11, name: back, type: String, origin: 2, queue: {drop_oldest: WAITING}}
 ";
+
+fn mapping(waiting: u32) -> String {
+    MAPPING.replace("WAITING", &waiting.to_string())
+}
 
 #[derive(Default)]
 struct Sum {

@@ -9,33 +9,41 @@ use crate::through::{NAMES, WAITING, Ways};
 
 /// Measures the work per message, and the idle programs for some seconds.
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
-    per_message(cell, seconds);
+    println!("\nThe work of each message, {seconds} s for each load:\n");
+    println!(
+        "| load | way | process | p50 (us) | p99 (us) | system calls per message | wake-ups per message | CPU per message (us) |"
+    );
+    println!("|---|---|---|---|---|---|---|---|");
+    let two = ["bridge-ros1", "bridge-ros2"];
+    per_message(&mut Ways::stand(cell, WAITING), seconds, &two);
+    let one = ["ua-cell with both bridges"];
+    per_message(&mut Ways::in_one_process(cell, WAITING), seconds, &one);
     idle(cell, seconds);
 }
 
-fn per_message(cell: &Cell, seconds: u64) {
-    let mut ways = Ways::stand(cell, WAITING);
-    println!("\nThe work of each message, {seconds} s for each load:\n");
-    println!(
-        "| load | way | program | system calls per message | wake-ups per message | CPU per message (us) |"
-    );
-    println!("|---|---|---|---|---|---|");
+/// Prints the work of each process of the bridges. The delays are those of the whole way.
+fn per_message(ways: &mut Ways, seconds: u64, names: &[&str]) {
     for (load, pace) in loads(seconds) {
         for way in [1, 2] {
             let name = NAMES.get(way).copied().unwrap_or_default();
             // A first turn lets discovery settle; the calls are counted in a turn of their own.
             ways.send(way, Pace { ticks: 100, ..pace });
-            let before = ways.bridges().map(Used::of);
+            let used = |ways: &Ways| ways.bridges().iter().map(Used::of).collect::<Vec<_>>();
+            let before = used(ways);
+            let mut report = ways.send(way, pace);
+            let after = used(ways);
+            let bridges = ways.bridges().iter();
+            let counting = bridges.map(|bridge| SystemCalls::count(bridge.id()));
+            let counting: Vec<_> = counting.collect();
             ways.send(way, pace);
-            let after = ways.bridges().map(Used::of);
-            let counting = ways.bridges().map(|bridge| SystemCalls::count(bridge.id()));
-            ways.send(way, pace);
-            let calls = counting.map(|counting| counting.and_then(SystemCalls::stop));
-            let programs = ["bridge-ros1", "bridge-ros2"].into_iter().zip(calls);
+            let calls = counting.into_iter();
+            let calls = calls.map(|counting| counting.and_then(SystemCalls::stop));
+            let programs = names.iter().zip(calls);
+            let [p50, p99] = [0.5, 0.99].map(|share| report.times.at(share));
             for ((program, calls), (before, after)) in programs.zip(before.into_iter().zip(after)) {
                 let each = |count: u64| count as f64 / pace.ticks as f64;
                 println!(
-                    "| {load} | {name} | {program} | {} | {:.2} | {:.1} |",
+                    "| {load} | {name} | {program} | {p50:.1} | {p99:.1} | {} | {:.2} | {:.1} |",
                     calls.map_or_else(|| "-".to_owned(), |calls| format!("{:.2}", each(calls))),
                     each(after.wake_ups - before.wake_ups),
                     (after.time - before.time).as_secs_f64() * 1e6 / pace.ticks as f64
