@@ -4,6 +4,7 @@ mod alarm;
 mod bindings;
 mod broker;
 mod calls;
+mod carriers;
 mod cell;
 mod confirm;
 mod environment;

@@ -2,6 +2,7 @@
 //! across keys.
 
 mod alarm;
+mod carriers;
 mod security;
 
 use std::collections::BTreeMap;
@@ -17,6 +18,7 @@ use crate::server_entries::{FindSkillsEntry, FromEntry, RemoteServerEntry, ToEnt
 use crate::tree::{Kind, Node, Place};
 
 pub(crate) use alarm::{AlarmEntry, ReportsEntry};
+pub(crate) use carriers::{CarrierEntry, PubSubForm, UdpEntry};
 pub(crate) use security::{
     GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
 };
@@ -33,8 +35,8 @@ document! {
         /// Folders with ROS packages, or single files, with definitions (.msg, .srv, .action, .idl)
         /// that take precedence over built-in definitions; relative to this file. At most 256.
         type_paths: Vec<At<String>>,
-        /// How values travel between the spaces.
-        pubsub: PubSubEntry,
+        /// How values travel between the spaces: a map, or a list of carriers.
+        pubsub: PubSubForm,
         /// Groups of programs that may read and write messages: SecurityGroups of OPC UA PubSub, at
         /// most 64. Default: every program of the network may.
         security: Vec<At<GroupEntry>>,
@@ -118,6 +120,10 @@ document! {
 
     /// Settings of an MQTT broker. Programs that share a broker and its prefix are one space.
     struct MqttEntry {
+        /// Address of the broker, such as mqtt://broker.local:1883, in a list of carriers. Without a
+        /// list, `address` of `pubsub` is the address.
+        #[schemars(regex(pattern = r"^(opc\.)?mqtts?://"))]
+        address: String,
         /// Version of MQTT. Default: 5.0, and 3.1.1 if the broker refuses it.
         version: MqttVersionEntry,
         /// First levels of every topic; default `opcua`.

@@ -2,7 +2,7 @@
 
 use crate::check::Source;
 use crate::code::Code;
-use crate::document::{self, Document};
+use crate::document::{self, Document, PubSubForm};
 use crate::findings::Findings;
 use crate::read::{At, Field, Reader};
 use crate::surroundings::{Readers, Surroundings, beside, fits};
@@ -301,8 +301,8 @@ impl<'a> Loader<'a> {
 /// reports it.
 fn key_files(document: &mut Document) -> impl Iterator<Item = &mut String> {
     let pubsub = document.pubsub.as_mut().and_then(|at| at.value.as_mut());
-    let mqtt = pubsub.and_then(|pubsub| pubsub.mqtt.as_mut()?.value.as_mut());
-    let of_broker = mqtt.into_iter().flat_map(|mqtt| {
+    let brokers = pubsub.into_iter().flat_map(PubSubForm::brokers);
+    let of_broker = brokers.flat_map(|mqtt| {
         let files = [
             &mut mqtt.ca,
             &mut mqtt.certificate,

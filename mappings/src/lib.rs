@@ -3,6 +3,7 @@
 mod alarm;
 mod broker;
 mod call;
+mod carriers;
 mod check;
 mod code;
 mod diagnostic;
@@ -40,6 +41,7 @@ pub use call::{
     Assigned, Assignment, Call, CallBinding, CallKind, CallTarget, ExecutedBy, FieldMap,
     MethodTarget,
 };
+pub use carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
 pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin, TypeUse};
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};

@@ -12,6 +12,7 @@ use uadp::BuiltinType;
 use crate::alarm::Alarm;
 use crate::broker::Broker;
 use crate::call::{Call, CallBinding};
+use crate::carriers::ConfiguredCarrier;
 use crate::endpoint::Endpoint;
 use crate::loss::{Loss, Motion};
 use crate::node_id::NodeIdText;
@@ -372,9 +373,14 @@ pub struct PubSub {
     /// wait to be sent and fit into [`max_datagram`](Self::max_datagram) and an Ethernet frame; 1
     /// sends each alone.
     pub messages_per_datagram: u8,
+    /// The carriers of a mapping that lists several; empty for a mapping with one.
+    /// [`address`](Self::address) and [`broker`](Self::broker) are then the first of each kind.
+    pub carriers: Vec<ConfiguredCarrier>,
 }
 
 impl PubSub {
+    /// The largest number of carriers.
+    pub const MOST_CARRIERS: usize = 4;
     /// The largest UDP payload over IPv4.
     pub const LARGEST_DATAGRAM: u16 = 65_507;
     /// Size for the headers of a chunk and a part of the message.
@@ -421,6 +427,7 @@ impl Default for PubSub {
             max_datagram: Self::LARGEST_DATAGRAM,
             max_message: 64 << 20,
             messages_per_datagram: 1,
+            carriers: Vec::new(),
         }
     }
 }

@@ -130,7 +130,7 @@ impl FromStr for TopicId {
 }
 
 /// Reads a number; each number has one spelling: digits only, no sign, no leading zero.
-fn decimal(part: Part, text: &str) -> Result<u16, TopicError> {
+pub(crate) fn decimal(part: Part, text: &str) -> Result<u16, TopicError> {
     let canonical = !text.is_empty()
         && text.bytes().all(|b| b.is_ascii_digit())
         && (text == "0" || !text.starts_with('0'));

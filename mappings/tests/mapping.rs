@@ -5,8 +5,8 @@ use std::num::NonZeroU16;
 use std::time::Duration;
 
 use mappings::{
-    Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, ServiceRole,
-    SpaceId, TopicId, Trigger, UaField,
+    CarrierMedium, Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy,
+    ServiceRole, SpaceId, TopicId, Trigger, UaField,
 };
 use messages::{Conversion, Leaf, Literal, Part, Rank, Selected, Selection};
 use proptest::prelude::*;
@@ -94,6 +94,42 @@ fn everything_of_the_network_can_be_said() {
         v6.pubsub().address,
         "[ff05::40]:4840".parse::<SocketAddr>().unwrap()
     );
+}
+
+#[test]
+fn a_list_names_several_carriers_with_their_names_and_common_settings() {
+    let mapping = sound(
+        "pubsub:\n  - udp: {address: opc.udp://239.192.0.41, interface: eth1, ttl: 3}\n    forward: [ua_1_2, \
+         ua_2_5_10]\n  - mqtt: {address: mqtt://broker.local, prefix: plant, within: 2s}\n    forward: [ua_3]\n  - \
+         settings: {key_frame_period: 500ms}\n",
+    );
+    let pubsub = mapping.pubsub();
+    let names = |at: usize| -> Vec<String> {
+        let names = pubsub.carriers[at].forward.iter();
+        names.map(ToString::to_string).collect()
+    };
+    assert_eq!(pubsub.carriers.len(), 2);
+    assert_eq!(names(0), ["ua_1_2", "ua_2_5_10"]);
+    assert_eq!(names(1), ["ua_3"]);
+    let (CarrierMedium::Udp(udp), CarrierMedium::Mqtt(broker)) =
+        (&pubsub.carriers[0].medium, &pubsub.carriers[1].medium)
+    else {
+        panic!("{pubsub:?}");
+    };
+    assert_eq!(udp.address, "239.192.0.41:4840".parse().unwrap());
+    assert_eq!((udp.interface.as_deref(), udp.ttl), (Some("eth1"), 3));
+    assert_eq!(broker.address.to_string(), "mqtt://broker.local:1883");
+    assert_eq!(broker.within, Duration::from_secs(2));
+    assert_eq!(pubsub.key_frame_period, Duration::from_millis(500));
+    assert_eq!(pubsub.address, udp.address);
+    assert_eq!(pubsub.broker.as_ref(), Some(broker));
+
+    let one = sound("pubsub: [{udp: {address: opc.udp://239.192.0.41}}]");
+    let map = sound("pubsub: {address: opc.udp://239.192.0.41}");
+    assert_eq!(one.pubsub(), map.pubsub());
+    let one = sound("pubsub: [{mqtt: {address: mqtt://broker, qos: 1}}]");
+    let map = sound("pubsub: {address: mqtt://broker, mqtt: {qos: 1}}");
+    assert_eq!(one.pubsub(), map.pubsub());
 }
 
 #[test]

@@ -9,6 +9,7 @@ use crate::document::{EncodingEntry, MqttEntry, MqttVersionEntry, PubSubEntry, T
 use crate::findings::Findings;
 use crate::read::{Field, given, short};
 use crate::secret::has_user;
+use crate::tree::Place;
 
 /// Returns the broker of the mapping; `None` if the messages are carried by UDP.
 pub(super) fn check(entry: &PubSubEntry, findings: &mut Findings) -> Option<Box<Broker>> {
@@ -24,6 +25,23 @@ pub(super) fn check(entry: &PubSubEntry, findings: &mut Findings) -> Option<Box<
         }
         return None;
     };
+    if let Some((mqtt, _)) = given(&entry.mqtt)
+        && let Some(at) = &mqtt.address
+    {
+        let message = "the broker has two addresses";
+        let note = findings.error(Code::Address, at.place, message);
+        note.help("remove this address: `address` of `pubsub` is the address");
+    }
+    let mqtt = given(&entry.mqtt).map(|(mqtt, _)| mqtt);
+    at((text.as_str(), place), mqtt, findings)
+}
+
+/// Returns the broker at an address.
+pub(super) fn at(
+    (text, place): (&str, Place),
+    entry: Option<&MqttEntry>,
+    findings: &mut Findings,
+) -> Option<Box<Broker>> {
     let Some(address) = BrokerAddress::parse(text) else {
         let message = format!("`{}` is not an address of a broker", short(text));
         let mut note = findings.error(Code::Address, place, message);
@@ -35,7 +53,7 @@ pub(super) fn check(entry: &PubSubEntry, findings: &mut Findings) -> Option<Box<
         return None;
     };
     let mut broker = Broker::new(address);
-    let Some((mqtt, _)) = given(&entry.mqtt) else {
+    let Some(mqtt) = entry else {
         return Some(Box::new(broker));
     };
     broker.version = given(&mqtt.version).map(|(version, _)| match version {

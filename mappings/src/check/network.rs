@@ -6,11 +6,12 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::cell::is_uri;
-use super::{broker, permissions};
+use super::{broker, carriers, permissions};
 use crate::broker::BrokerAddress;
 use crate::code::Code;
 use crate::document::{
-    HistoryEntry, LimitsEntry, PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry,
+    HistoryEntry, LimitsEntry, PubSubEntry, PubSubForm, PublisherIdEntry, SecurityEntry,
+    ServerEntry,
 };
 use crate::endpoint::Endpoint;
 use crate::findings::Findings;
@@ -20,27 +21,27 @@ use crate::read::{At, Field, given, short};
 use crate::secret::has_user;
 use crate::tree::Place;
 
-pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -> PubSub {
-    let default = PubSub::default();
-    let Some(entry) = entry.and_then(|at| at.value.as_ref()) else {
-        return default;
+pub(super) fn pubsub(entry: Option<&At<PubSubForm>>, findings: &mut Findings) -> PubSub {
+    let Some(At { place, value }) = entry else {
+        return PubSub::default();
     };
+    match value {
+        None => PubSub::default(),
+        Some(PubSubForm::One(entry)) => settings(entry, findings),
+        Some(PubSubForm::Several(entries)) => carriers::check(entries, *place, findings),
+    }
+}
+
+/// Returns the settings of a single carrier.
+pub(super) fn settings(entry: &PubSubEntry, findings: &mut Findings) -> PubSub {
+    let default = PubSub::default();
     let broker = broker::check(entry, findings);
     let address = given(&entry.address)
         .filter(|(text, _)| !BrokerAddress::is_mqtt(text))
         .and_then(|(text, place)| address(text, place, findings));
     let interface =
         given(&entry.interface).and_then(|(text, place)| interface(text, place, findings));
-    let ttl = given(&entry.ttl).and_then(|(number, place)| {
-        let ttl = u8::try_from(*number).ok();
-        if ttl.is_none() {
-            let message = format!("the ttl {number} exceeds 255");
-            findings
-                .error(Code::WrongValue, place, message)
-                .label("0 to 255");
-        }
-        ttl
-    });
+    let ttl = ttl(&entry.ttl, findings);
     let publisher_id = match given(&entry.publisher_id) {
         Some((PublisherIdEntry::AnyWidth, _)) => PublisherIdRule::AnyWidth,
         Some((PublisherIdEntry::Exact, _)) | None => PublisherIdRule::Exact,
@@ -69,9 +70,22 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
         messages_per_datagram: together
             .and_then(|count| u8::try_from(count).ok())
             .unwrap_or(default.messages_per_datagram),
+        carriers: Vec::new(),
     };
     timing(entry, &pubsub, findings);
     pubsub
+}
+
+pub(super) fn ttl(field: &Field<u16>, findings: &mut Findings) -> Option<u8> {
+    let (number, place) = given(field)?;
+    let ttl = u8::try_from(*number).ok();
+    if ttl.is_none() {
+        let message = format!("the ttl {number} exceeds 255");
+        findings
+            .error(Code::WrongValue, place, message)
+            .label("0 to 255");
+    }
+    ttl
 }
 
 pub(super) fn within(
@@ -123,7 +137,7 @@ fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
 }
 
 /// Reads `opc.udp://host:port`; the default port is 4840 (OPC 10000-14, 7.3.2).
-fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAddr> {
+pub(super) fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAddr> {
     let Some(address) = PubSub::parse_address(text) else {
         let message = format!("`{}` is not a PubSub address", short(text));
         let mut note = findings.error(Code::Address, place, message);
@@ -181,7 +195,7 @@ fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAd
 /// Longest name of a network interface of Linux.
 const MAX_INTERFACE: usize = 15;
 
-fn interface(text: &str, place: Place, findings: &mut Findings) -> Option<String> {
+pub(super) fn interface(text: &str, place: Place, findings: &mut Findings) -> Option<String> {
     let named = !text.is_empty()
         && text.len() <= MAX_INTERFACE
         && !text.contains(|c: char| c.is_whitespace() || c.is_control() || c == '/');

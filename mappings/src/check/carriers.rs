@@ -1,0 +1,264 @@
+//! The list of carriers.
+
+use super::broker;
+use super::network::{address, interface, settings, ttl};
+use crate::broker::{Broker, BrokerAddress};
+use crate::carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
+use crate::code::Code;
+use crate::document::{CarrierEntry, MqttEntry, PubSubEntry, UdpEntry};
+use crate::findings::Findings;
+use crate::mapping::PubSub;
+use crate::read::{At, given, short};
+use crate::tree::Place;
+
+/// Returns the settings of a list of carriers.
+pub(super) fn check(entries: &[At<CarrierEntry>], place: Place, findings: &mut Findings) -> PubSub {
+    let mut pubsub = common(entries, findings);
+    let mut carriers: Vec<ConfiguredCarrier> = Vec::new();
+    let mut names: Vec<Listed> = Vec::new();
+    for (number, at) in entries.iter().enumerate() {
+        let Some(entry) = &at.value else {
+            continue;
+        };
+        let Some(medium) = medium(entry, at.place, findings) else {
+            continue;
+        };
+        let is_twice = carriers
+            .iter()
+            .any(|known| is_same_network(&known.medium, &medium));
+        if is_twice {
+            let message = "two entries have the same address, so each message would cross twice";
+            let note = findings.error(Code::Carriers, at.place, message);
+            note.help("remove one of the entries");
+        }
+        let forward = forwarded(entry, number, &mut names, findings);
+        carriers.push(ConfiguredCarrier { medium, forward });
+    }
+    let most = PubSub::MOST_CARRIERS;
+    if carriers.len() > most {
+        let message = format!("{} carriers are too many", carriers.len());
+        let note = findings.error(Code::Carriers, place, message);
+        note.label(format!("at most {most}"));
+    }
+    let is_settings = |entry: &CarrierEntry| entry.udp.is_none() && entry.mqtt.is_none();
+    let mut all = entries.iter();
+    if all.all(|at| at.value.as_ref().is_some_and(is_settings)) {
+        let note = findings.error(Code::Carriers, place, "the list has no carrier");
+        note.help(EXAMPLE);
+    }
+    if let ([alone], [first, ..]) = (carriers.as_slice(), names.as_slice())
+        && entries
+            .iter()
+            .filter(|at| !at.value.as_ref().is_some_and(is_settings))
+            .count()
+            == 1
+        && !alone.forward.is_empty()
+    {
+        let message = "there is no other carrier to forward to";
+        let note = findings.warning(Code::Forward, first.place, message);
+        note.help(EXAMPLE);
+    }
+    adopt(&mut pubsub, carriers);
+    pubsub
+}
+
+/// Sets the first carrier of each kind, and the list if there are several carriers.
+fn adopt(pubsub: &mut PubSub, carriers: Vec<ConfiguredCarrier>) {
+    let udp = carriers.iter().find_map(|carrier| match &carrier.medium {
+        CarrierMedium::Udp(group) => Some(group.clone()),
+        CarrierMedium::Mqtt(_) => None,
+    });
+    if let Some(UdpGroup {
+        address,
+        interface,
+        ttl,
+    }) = udp
+    {
+        pubsub.address = address;
+        pubsub.interface = interface;
+        pubsub.ttl = ttl;
+    }
+    pubsub.broker = carriers.iter().find_map(|carrier| match &carrier.medium {
+        CarrierMedium::Mqtt(broker) => Some(broker.clone()),
+        CarrierMedium::Udp(_) => None,
+    });
+    if carriers.len() > 1 {
+        pubsub.carriers = carriers;
+    }
+}
+
+/// Returns the settings of all carriers.
+fn common(entries: &[At<CarrierEntry>], findings: &mut Findings) -> PubSub {
+    let of = |at: &'_ At<CarrierEntry>| at.value.as_ref()?.settings.clone();
+    let mut all = entries.iter().filter_map(of);
+    let Some(first) = all.next() else {
+        return PubSub::default();
+    };
+    for other in all {
+        let note = findings.error(
+            Code::Carriers,
+            other.place,
+            "`settings` are for all carriers, and occur once",
+        );
+        note.help("move the keys into the first `settings`");
+    }
+    let Some(entry) = first.value else {
+        return PubSub::default();
+    };
+    let PubSubEntry {
+        address,
+        mqtt,
+        interface,
+        ttl,
+        ..
+    } = &entry;
+    let places = [
+        ("address", address.as_ref().map(|at| at.place)),
+        ("mqtt", mqtt.as_ref().map(|at| at.place)),
+        ("interface", interface.as_ref().map(|at| at.place)),
+        ("ttl", ttl.as_ref().map(|at| at.place)),
+    ];
+    for (key, place) in places {
+        if let Some(place) = place {
+            let message = format!("`{key}` is a setting of a carrier");
+            let note = findings.error(Code::Carriers, place, message);
+            note.help(EXAMPLE);
+        }
+    }
+    settings(&entry, findings)
+}
+
+/// Returns the network of an entry; `None` for an entry with settings, and for a faulty entry.
+fn medium(entry: &CarrierEntry, place: Place, findings: &mut Findings) -> Option<CarrierMedium> {
+    match (&entry.udp, &entry.mqtt, &entry.settings) {
+        (Some(udp), None, None) => udp_group(udp.value.as_ref()?, findings).map(CarrierMedium::Udp),
+        (None, Some(mqtt), None) => {
+            let broker = listed_broker(mqtt.value.as_ref()?, mqtt.place, findings)?;
+            Some(CarrierMedium::Mqtt(broker))
+        }
+        (None, None, Some(_)) => {
+            if let Some(at) = &entry.forward {
+                let message = "`forward` belongs to a carrier";
+                findings
+                    .error(Code::Carriers, at.place, message)
+                    .help(EXAMPLE);
+            }
+            None
+        }
+        _ => {
+            let message = "an entry has one of `udp`, `mqtt` and `settings`";
+            findings.error(Code::Carriers, place, message).help(EXAMPLE);
+            None
+        }
+    }
+}
+
+fn udp_group(entry: &UdpEntry, findings: &mut Findings) -> Option<UdpGroup> {
+    let url = match given(&entry.address) {
+        None if entry.address.is_some() => return None,
+        None => Some(PubSub::ADDRESS),
+        Some((text, place)) => address(text, place, findings),
+    };
+    let named = given(&entry.interface);
+    let interface = named.and_then(|(text, place)| interface(text, place, findings));
+    Some(UdpGroup {
+        address: url?,
+        interface,
+        ttl: ttl(&entry.ttl, findings).unwrap_or(1),
+    })
+}
+
+fn listed_broker(entry: &MqttEntry, place: Place, findings: &mut Findings) -> Option<Box<Broker>> {
+    let Some(at) = &entry.address else {
+        let message = "a broker in a list needs its `address`";
+        let note = findings.error(Code::MissingKey, place, message);
+        note.help(format!("address: {}", BrokerAddress::EXAMPLE));
+        return None;
+    };
+    let text = at.value.as_deref()?;
+    broker::at((text, at.place), Some(entry), findings)
+}
+
+fn is_same_network(one: &CarrierMedium, other: &CarrierMedium) -> bool {
+    match (one, other) {
+        (CarrierMedium::Udp(one), CarrierMedium::Udp(other)) => {
+            one.address == other.address && one.interface == other.interface
+        }
+        (CarrierMedium::Mqtt(one), CarrierMedium::Mqtt(other)) => {
+            one.address == other.address && one.prefix == other.prefix
+        }
+        (CarrierMedium::Udp(_), CarrierMedium::Mqtt(_))
+        | (CarrierMedium::Mqtt(_), CarrierMedium::Udp(_)) => false,
+    }
+}
+
+/// A name under `forward`.
+struct Listed {
+    name: ForwardedName,
+    place: Place,
+    /// The number of the entry.
+    number: usize,
+}
+
+/// Returns the names that a carrier forwards.
+fn forwarded(
+    entry: &CarrierEntry,
+    number: usize,
+    names: &mut Vec<Listed>,
+    findings: &mut Findings,
+) -> Vec<ForwardedName> {
+    let mut own = Vec::new();
+    let Some((entries, place)) = given(&entry.forward) else {
+        return own;
+    };
+    if entries.len() > MOST_NAMES {
+        let message = format!("{} names are too many", entries.len());
+        let note = findings.error(Code::Forward, place, message);
+        note.label(format!(
+            "at most {MOST_NAMES}; a space or a namespace is one name"
+        ));
+        return own;
+    }
+    for at in entries {
+        let Some(text) = &at.value else {
+            continue;
+        };
+        let Ok(name) = text.parse::<ForwardedName>() else {
+            let message = format!("`{}` is not a name of the space", short(text));
+            let note = findings.error(Code::Forward, at.place, message);
+            note.help("use a space (ua_1), a namespace of it (ua_1_2) or a topic (ua_1_2_10)");
+            continue;
+        };
+        let before = names.iter().find(|listed| listed.name.overlaps(name));
+        if let Some(Listed {
+            name: other,
+            place,
+            number: at_entry,
+        }) = before
+        {
+            let line = findings.line(*place, at.place);
+            if *at_entry == number {
+                let message = format!("`{name}` is also forwarded by `{other}`");
+                let note = findings.warning(Code::Forward, at.place, message);
+                note.label(format!("`{other}` is at {line}"));
+            } else {
+                let message = format!(
+                    "`{name}` is forwarded from two carriers, but its publisher is at one of them"
+                );
+                let note = findings.error(Code::Forward, at.place, message);
+                note.label(format!("`{other}` is at {line}"));
+            }
+        }
+        names.push(Listed {
+            name,
+            place: at.place,
+            number,
+        });
+        own.push(name);
+    }
+    own
+}
+
+const MOST_NAMES: usize = 1000;
+const EXAMPLE: &str = "pubsub: [{udp: {address: opc.udp://239.192.0.40:4840}, forward: [ua_1]}, {mqtt: \
+                       {address: mqtt://broker.local:1883}}, {settings: {key_frame_period: 1s}}]";

@@ -1,0 +1,84 @@
+//! The list of carriers.
+
+use schemars::JsonSchema;
+
+use super::{MqttEntry, PubSubEntry};
+use crate::read::{At, Field, Read, Reader, document};
+use crate::tree::{Kind, Node};
+
+document! {
+    /// A carrier of the space, or the settings of all carriers.
+    struct CarrierEntry {
+        /// UDP multicast or unicast.
+        udp: UdpEntry,
+        /// An MQTT broker; its `address` is required.
+        mqtt: MqttEntry,
+        /// Names of publishers at this carrier, whose messages are forwarded to the other carriers:
+        /// a space (ua_1), a namespace of it (ua_1_2) or a topic (ua_1_2_10), at most 1000. Requests
+        /// of calls and confirmations of commands cross in the other direction. Default: none.
+        forward: Vec<At<String>>,
+        /// Settings of all carriers, in an entry without a carrier.
+        settings: PubSubEntry,
+    }
+
+    /// UDP multicast or unicast.
+    struct UdpEntry {
+        /// Multicast group or unicast address and port; default opc.udp://239.192.0.40:4840.
+        #[schemars(regex(pattern = r"^opc\.udp://"))]
+        address: String,
+        /// Name or address of the network interface. Default: the operating system chooses.
+        interface: String,
+        /// Hops a multicast datagram may travel. Default 1: it stays on the link.
+        #[schemars(range(max = 255))]
+        ttl: u16,
+    }
+}
+
+/// The settings of a single carrier, or a list of carriers.
+#[derive(Clone, Debug)]
+pub(crate) enum PubSubForm {
+    One(Box<PubSubEntry>),
+    Several(Vec<At<CarrierEntry>>),
+}
+
+impl PubSubForm {
+    /// Returns the settings of the brokers.
+    pub(crate) fn brokers(&mut self) -> impl Iterator<Item = &mut MqttEntry> {
+        let (one, several): (Option<&mut Field<MqttEntry>>, &mut [At<CarrierEntry>]) = match self {
+            Self::One(entry) => (Some(&mut entry.mqtt), &mut []),
+            Self::Several(entries) => (None, entries.as_mut_slice()),
+        };
+        let several = several.iter_mut().filter_map(|at| at.value.as_mut());
+        let fields = one.into_iter().chain(several.map(|entry| &mut entry.mqtt));
+        fields.filter_map(|field| field.as_mut()?.value.as_mut())
+    }
+}
+
+impl Read for PubSubForm {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+        match &node.kind {
+            Kind::List(_) => Vec::read(node, reader).map(Self::Several),
+            Kind::Scalar(_) | Kind::Null | Kind::Map(_) => {
+                PubSubEntry::read(node, reader).map(|entry| Self::One(Box::new(entry)))
+            }
+        }
+    }
+}
+
+impl JsonSchema for PubSubForm {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "PubSubForm".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        let one = generator.subschema_for::<PubSubEntry>();
+        let carrier = generator.subschema_for::<CarrierEntry>();
+        schemars::json_schema!({
+            "anyOf": [one, { "type": "array", "items": carrier, "minItems": 1 }]
+        })
+    }
+}
