@@ -75,6 +75,27 @@ pub trait Carrier: fmt::Debug + Send {
         None
     }
 
+    /// Returns the properties of the network by which the last message was received.
+    fn arrival(&self) -> Arrival {
+        Arrival {
+            senders: self.senders(),
+            within: self.within(),
+            is_forwarded: false,
+            not_forwarded: None,
+        }
+    }
+
+    /// Returns the state of the carrier; of each carrier, if there are several.
+    fn states(&self) -> Vec<CarrierState> {
+        vec![CarrierState {
+            network: self.interface(),
+            senders: self.senders(),
+            lost: self.lost(),
+            traffic: None,
+            dropped: self.dropped(),
+        }]
+    }
+
     /// Returns the number of messages that the carrier dropped, by reason.
     fn dropped(&self) -> Vec<(&'static str, u64)> {
         Vec::new()
@@ -149,15 +170,55 @@ pub struct Received {
     pub from: SocketAddr,
 }
 
-/// The distinction of senders.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The distinction of senders, from the weakest to the strongest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Senders {
-    /// Each sender has an address.
-    Addresses,
     /// A broker hides the senders, and accepts messages from every client.
     Hidden,
     /// A broker hides the senders, and its access rules decide who may publish on which topic.
     Authorized,
+    /// Each sender has an address.
+    Addresses,
+}
+
+/// The properties of the network by which a message was received.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Arrival {
+    /// How far the network tells senders apart.
+    pub senders: Senders,
+    /// The time after which the message counts as late; `None` if the network does not store
+    /// messages.
+    pub within: Option<Duration>,
+    /// Whether the message was forwarded to another carrier.
+    pub is_forwarded: bool,
+    /// The reason why a message of a route was not forwarded.
+    pub not_forwarded: Option<&'static str>,
+}
+
+/// The state of a carrier.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CarrierState {
+    /// Name of the network interface or broker.
+    pub network: String,
+    /// How far the carrier tells senders apart.
+    pub senders: Senders,
+    /// The reason why no messages are received and sent.
+    pub lost: Option<String>,
+    /// Numbers of messages; `None` for the only carrier of a program, whose topics have them.
+    pub traffic: Option<Traffic>,
+    /// Numbers of messages that were dropped, by reason.
+    pub dropped: Vec<(&'static str, u64)>,
+}
+
+/// Numbers of messages of one of several carriers.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Traffic {
+    /// Messages that were received, own messages included.
+    pub received: u64,
+    /// Own messages that were sent.
+    pub sent: u64,
+    /// Messages of other carriers that were sent.
+    pub forwarded: u64,
 }
 
 /// A change of the network of a carrier.

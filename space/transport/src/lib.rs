@@ -7,13 +7,17 @@
 
 mod batch;
 mod carrier;
+mod carriers;
 mod filter;
 mod in_process;
 mod interface;
 mod udp;
 mod watch;
 
-pub use carrier::{BUFFER, Carrier, CarrierChange, Outgoing, Received, Senders};
+pub use carrier::{
+    Arrival, BUFFER, Carrier, CarrierChange, CarrierState, Outgoing, Received, Senders, Traffic,
+};
+pub use carriers::{CarrierRules, Carriers, ForwardTo, Judgement, MessagePath};
 pub use in_process::ProcessHub;
 pub use interface::{Interface, InterfaceError, interfaces};
 pub use udp::{OpenError, Options, SendError, Udp};
