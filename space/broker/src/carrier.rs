@@ -444,7 +444,8 @@ impl Carrier for Mqtt {
             self.announce(&network, address);
             return Ok(());
         }
-        if address.kind == MessageType::Data {
+        // A forwarded value is of another publisher.
+        if address.kind == MessageType::Data && self.settings.publisher == Some(address.publisher) {
             self.reports.uses(address, instant());
         }
         let is_json = address.kind == MessageType::Data && !message.command && self.writes_json();

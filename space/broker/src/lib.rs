@@ -25,10 +25,12 @@ mod packets;
 mod producers;
 mod queue;
 mod reports;
+mod scope;
 mod settings;
 mod stream;
 mod topics;
 
 pub use carrier::Mqtt;
 pub use connection::STALL;
+pub use scope::{MessageRole, MessageScope, scope};
 pub use settings::{Identity, OpenError};
