@@ -50,6 +50,12 @@ impl Relay {
     }
 }
 
+/// Returns whether a message of this time is late, or dated too far in the future to judge.
+#[must_use]
+pub fn is_aged(time: Timestamp, now: Timestamp, within: Duration) -> bool {
+    aged(time, now, within).is_some()
+}
+
 /// Returns the reason why a message of this time is late. A time in the future cannot be judged:
 /// the clocks differ.
 fn aged(time: Timestamp, now: Timestamp, within: Duration) -> Option<Late> {

@@ -62,6 +62,7 @@ pub use description::{Described, ROS_TOPICS};
 pub use fields::{decode_fields, encode_fields};
 pub use guard::{GroupState, Guard, KeyDelivery, Unopened, policy_of};
 pub use hops::{Delays, Hop, Hops};
+pub use late::is_aged;
 pub use loop_rule::{Owned, Side, What, may_cross};
 pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
 pub use redundancy::{
@@ -70,7 +71,7 @@ pub use redundancy::{
 };
 pub use room::Room;
 pub use router::{MutedSamples, Router};
-pub use settings::{Local, Now, Relay, Settings};
+pub use settings::{Forwarding, Local, Now, Relay, Settings};
 pub use tap::{Crossing, Tapped};
 pub use uadp::action::{ExecutionId, Refusal};
 pub use uadp::discovery::MessageSecurityMode;

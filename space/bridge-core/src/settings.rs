@@ -30,6 +30,18 @@ pub struct Relay {
     pub limit: Option<u16>,
 }
 
+/// Whether a received message belongs to a route between carriers.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Forwarding {
+    /// It belongs to no route.
+    #[default]
+    None,
+    /// It was forwarded.
+    Forwarded,
+    /// It was not forwarded, for this reason.
+    Refused(&'static str),
+}
+
 /// The payload format of a local side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Local {

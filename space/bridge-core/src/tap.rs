@@ -47,6 +47,11 @@ pub enum Crossing {
         /// Whether the message has no value.
         keep_alive: bool,
     },
+    /// A received message belongs to a route between carriers.
+    Forwarded {
+        /// The reason why it was not forwarded; `None` if it was forwarded.
+        refused: Option<&'static str>,
+    },
     /// The local side has published a sample of another space.
     Published {
         /// The time from the arrival of the datagram, in nanoseconds.

@@ -7,7 +7,7 @@ use uadp::{NetworkHeader, Timestamp};
 
 use super::{Router, Values};
 use crate::confirm::Confirming;
-use crate::settings::{Now, Relay};
+use crate::settings::{Forwarding, Now, Relay};
 use crate::topic::Topic;
 use crate::topics::Handle;
 
@@ -20,6 +20,14 @@ impl Router {
     /// too.
     pub const fn set_relay(&mut self, relay: Option<Relay>) {
         self.values.relay = relay;
+        self.values.arrival = relay;
+    }
+
+    /// Sets the properties of the network by which the next message is received, if the program
+    /// has several networks. [`set_relay`](Self::set_relay) sets the same for all.
+    pub const fn set_arrival(&mut self, relay: Option<Relay>, forwarding: Forwarding) {
+        self.values.arrival = relay;
+        self.values.forwarding = forwarding;
     }
 
     /// Returns the time after which a message of the topic must not be delivered any more; `None`
@@ -55,16 +63,13 @@ impl Values {
         self.relay.is_some() && self.topics.at(at).is_some_and(is_command)
     }
 
-    /// Returns the headers of a request or a response. Over a broker they contain
-    /// the time of sending.
-    pub(super) fn action_header(&self, now: Now) -> NetworkHeader<'static> {
-        match self.relay {
-            None => NetworkHeader::default(),
-            Some(_) => NetworkHeader {
-                timestamp: Some(now.utc.time),
-                picoseconds: Some(now.utc.picoseconds),
-                ..NetworkHeader::default()
-            },
+    /// Returns the headers of a request or a response. They contain the time of sending, because
+    /// another program may forward the message to a broker, which may deliver it late.
+    pub(super) fn action_header(now: Now) -> NetworkHeader<'static> {
+        NetworkHeader {
+            timestamp: Some(now.utc.time),
+            picoseconds: Some(now.utc.picoseconds),
+            ..NetworkHeader::default()
         }
     }
 
@@ -76,7 +81,7 @@ impl Values {
         left: Option<Duration>,
         now: Now,
     ) -> bool {
-        let (Some(_), Some(time), Some(left)) = (self.relay, header.timestamp, left) else {
+        let (Some(_), Some(time), Some(left)) = (self.arrival, header.timestamp, left) else {
             return false;
         };
         let age = now.utc.unix_nanos() - Timestamp::from(time).unix_nanos();
@@ -85,6 +90,6 @@ impl Values {
 
     /// Returns whether a request without a time of sending was received over a broker.
     pub(super) const fn is_untimed(&self, header: &NetworkHeader<'_>) -> bool {
-        self.relay.is_some() && header.timestamp.is_none()
+        self.arrival.is_some() && header.timestamp.is_none()
     }
 }

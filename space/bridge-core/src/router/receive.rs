@@ -21,7 +21,7 @@ use crate::network::number_of;
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
 use crate::reader::{Admitted, Handling};
-use crate::settings::{Local, Now};
+use crate::settings::{Forwarding, Local, Now};
 use crate::tap::Crossing;
 use crate::topic::{Item, Role, Topic};
 use crate::topics::Handle;
@@ -54,7 +54,7 @@ impl Router {
         let header = message.header();
         let late = self
             .values
-            .relay
+            .arrival
             .and_then(|relay| relay.judge_message(sent(&header), now.utc));
         if let Some((case, detail)) = late {
             return self
@@ -236,6 +236,14 @@ impl Values {
             sequence: message.sequence_number(),
             keep_alive: message.kind == MessageKind::KeepAlive,
         });
+        let refused = match self.forwarding {
+            Forwarding::None => None,
+            Forwarding::Forwarded => Some(None),
+            Forwarding::Refused(reason) => Some(Some(reason)),
+        };
+        if let Some(refused) = refused {
+            self.tap.note(topic, || Crossing::Forwarded { refused });
+        }
         if !message.is_valid() {
             return self.count(about, Reason::Invalid, 1, || {
                 "the writer marked its DataSetMessage as invalid".to_owned()
@@ -243,7 +251,7 @@ impl Values {
         }
         let mut place = place(topic, message, (from, sent));
         let local = self.settings.local;
-        let relay = self.relay;
+        let relay = self.arrival;
         let since_takeover = self.since_takeover(&place, now);
         let Some(at) = self.entry(topic, from, now) else {
             return;

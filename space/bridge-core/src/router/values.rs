@@ -26,7 +26,7 @@ use crate::output::{Delivery, Output};
 use crate::pace::Pace;
 use crate::plans::Plans;
 use crate::room::Room;
-use crate::settings::{Local, Now, Relay, Settings};
+use crate::settings::{Forwarding, Local, Now, Relay, Settings};
 use crate::tap::Tap;
 use crate::topic::{Item, Role};
 use crate::topics::{Handle, Topics};
@@ -54,6 +54,10 @@ pub(super) struct Values {
     pub(super) redundant: Option<Box<Redundant>>,
     /// The broker between the programs; `None` for a network that does not store messages.
     pub(super) relay: Option<Relay>,
+    /// The broker by which the current message was received.
+    pub(super) arrival: Option<Relay>,
+    /// The route of the current message.
+    pub(super) forwarding: Forwarding,
     /// The sender of the confirmations of each other space.
     pub(super) confirmers: BTreeMap<SpaceId, Confirmer>,
     /// The announced types of topics of other spaces.
@@ -97,6 +101,8 @@ impl Values {
             claims: Claims::default(),
             redundant: None,
             relay: None,
+            arrival: None,
+            forwarding: Forwarding::None,
             confirmers: BTreeMap::new(),
             learned: Learned::default(),
             layouts: Learned::default(),

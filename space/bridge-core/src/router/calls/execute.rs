@@ -310,7 +310,7 @@ impl Router {
             },
             None if self
                 .values
-                .relay
+                .arrival
                 .map_or_else(|| from.ip().is_loopback(), |relay| relay.authorized) =>
             {
                 RequestOrigin {
