@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::io::{self, Write as _};
 
-use mappings::{Broker, Mapping, SpaceId, TopicForm};
+use mappings::{Broker, CarrierMedium, ForwardedName, Mapping, SpaceId, TopicForm};
 
 use crate::arguments::Acl;
 use crate::exit::Failure;
@@ -48,9 +48,36 @@ fn rules(mapping: &Mapping) -> Result<String, Failure> {
         }
         shared(&mut text, prefix);
     }
+    let forwarded = forwarded(mapping);
+    if !forwarded.is_empty() {
+        let _written = writeln!(
+            text,
+            "\n# the program that forwards from the other carriers; add the rules of its own space\n\
+             user forwarder"
+        );
+        for space in forwarded {
+            for kind in OF_PUBLISHER {
+                let _written = writeln!(text, "topic write {prefix}/+/{kind}/{space}/#");
+            }
+            for topic in names(broker, mapping, space) {
+                let _written = writeln!(text, "topic write {topic}");
+            }
+        }
+        shared(&mut text, prefix);
+    }
     let _written = writeln!(text, "\n# ua-space; may also request each call\nuser tools");
     shared(&mut text, prefix);
     Ok(text)
+}
+
+/// Returns the spaces of which other carriers forward messages to the first broker. Confirmations
+/// of commands go to the broker too, but they need a name of their space as well.
+fn forwarded(mapping: &Mapping) -> BTreeSet<SpaceId> {
+    let carriers = mapping.pubsub().carriers.iter();
+    let is_broker = |medium: &CarrierMedium| matches!(medium, CarrierMedium::Mqtt(_));
+    let others = carriers.filter(|carrier| !is_broker(&carrier.medium));
+    let names = others.flat_map(|carrier| &carrier.forward);
+    names.map(|name: &ForwardedName| name.space()).collect()
 }
 
 /// Adds the rules of all users. A request and a probe have the topic of the space that they are
@@ -119,6 +146,19 @@ variables:
         let tools = users.next().unwrap();
         assert!(!tools.contains("/data/") && !tools.contains("/discovery/"));
         assert!(tools.contains("topic read cell/#"));
+    }
+
+    #[test]
+    fn a_program_that_forwards_may_write_the_messages_of_the_other_carrier() {
+        let cell = "pubsub: [{udp: {}, forward: [ua_1_2, ua_1_3]}, {mqtt: {address: \"mqtt://b\"}, forward: [ua_2]}]\n\
+                    spaces: [{id: 1}, {id: 2}]\n";
+        let mapping = Mapping::from_yaml(cell, "cell.yaml").mapping.unwrap();
+        let rules = rules(&mapping).unwrap();
+        let (_, forwarder) = rules.split_once("\nuser forwarder\n").unwrap();
+        let (forwarder, _) = forwarder.split_once("\nuser ").unwrap();
+        let written = "topic write opcua/+/data/1/#";
+        assert_eq!(forwarder.matches(written).count(), 1, "{forwarder}");
+        assert!(!forwarder.contains("/data/2/"), "{forwarder}");
     }
 
     #[test]

@@ -1,13 +1,24 @@
 //! The carrier of a program, from its command line and mapping.
 
+mod routes;
+
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
+use std::sync::Arc;
+
 use broker::{Identity, Mqtt};
-use mappings::{Broker, BrokerAddress, Mapping, PubSub, SpaceId};
-use transport::{Carrier, Options, ProcessHub, Udp};
+use mappings::{
+    Broker, BrokerAddress, CarrierMedium, ConfiguredCarrier, Mapping, PubSub, SpaceId, UdpGroup,
+};
+use tokio::sync::watch;
+use transport::{
+    Carrier, CarrierRules, Carriers, Judgement, MessagePath, Options, ProcessHub, Udp,
+};
 
 use crate::arguments::Arguments;
 use crate::exit::{Failure, FailureKind};
+use crate::mapping_file::Running;
+use routes::LiveRoutes;
 
 /// The source of own messages for a carrier that does not return them. No sender has this address.
 pub(crate) const NO_SOURCE: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
@@ -16,27 +27,86 @@ pub(crate) const NO_SOURCE: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LO
 /// Returns the options of its socket too, if it uses UDP.
 pub(crate) fn open(
     (program, own): (&str, SpaceId),
-    (arguments, mapping): (&Arguments, &Mapping),
+    (arguments, mapping): (&Arguments, &Arc<Mapping>),
+    changes: &watch::Receiver<Running>,
     (several, hub): (bool, Option<&ProcessHub>),
 ) -> Result<(Box<dyn Carrier>, Option<Options>), Failure> {
+    let identity = Identity {
+        program: program.to_owned(),
+        publisher: (!arguments.flags.dry_run).then(|| own.into()),
+    };
     let url = arguments.flags.address.as_deref();
-    if let Some(broker) = broker_of(url, mapping.pubsub())? {
-        let identity = Identity {
-            program: program.to_owned(),
-            publisher: (!arguments.flags.dry_run).then(|| own.into()),
+    let listed = &mapping.pubsub().carriers;
+    if url.is_none() && !listed.is_empty() {
+        let (carriers, options) = open_all(listed, &identity, arguments, (several, hub))?;
+        let rules: Box<dyn CarrierRules> = match arguments.flags.dry_run {
+            true => Box::new(NoRoutes),
+            false => Box::new(LiveRoutes::new(mapping, Some(changes.clone()))),
         };
-        let mqtt = Mqtt::open(&broker, &identity)
-            .map_err(|error| Failure::new(FailureKind::Configuration, format!("MQTT: {error}")))?;
-        return Ok((Box::new(mqtt), None));
+        return Ok((Box::new(Carriers::new(carriers, rules)), options));
+    }
+    if let Some(broker) = broker_of(url, mapping.pubsub())? {
+        return Ok((open_broker(&broker, &identity)?, None));
     }
     let options = options(arguments, mapping, several)?;
-    let udp = Udp::open(&options)
+    Ok((open_udp(&options, hub)?, Some(options)))
+}
+
+/// Opens the carriers of a list. Returns the options of the first socket too, if UDP is among them.
+fn open_all(
+    listed: &[ConfiguredCarrier],
+    identity: &Identity,
+    arguments: &Arguments,
+    (several, hub): (bool, Option<&ProcessHub>),
+) -> Result<(Vec<Box<dyn Carrier>>, Option<Options>), Failure> {
+    let mut carriers = Vec::new();
+    let mut first = None;
+    for ConfiguredCarrier { medium, .. } in listed {
+        let carrier = match medium {
+            CarrierMedium::Mqtt(broker) => open_broker(broker, identity)?,
+            CarrierMedium::Udp(group) => {
+                let options = udp_options(arguments, group, several)?;
+                let udp = open_udp(&options, hub)?;
+                first.get_or_insert(options);
+                udp
+            }
+        };
+        carriers.push(carrier);
+    }
+    Ok((carriers, first))
+}
+
+fn open_broker(broker: &Broker, identity: &Identity) -> Result<Box<dyn Carrier>, Failure> {
+    let mqtt = Mqtt::open(broker, identity)
+        .map_err(|error| Failure::new(FailureKind::Configuration, format!("MQTT: {error}")))?;
+    Ok(Box::new(mqtt))
+}
+
+fn open_udp(options: &Options, hub: Option<&ProcessHub>) -> Result<Box<dyn Carrier>, Failure> {
+    let udp = Udp::open(options)
         .map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
-    let carrier: Box<dyn Carrier> = match hub {
-        Some(hub) => hub.connect(udp, &options),
+    Ok(match hub {
+        Some(hub) => hub.connect(udp, options),
         None => Box::new(udp),
-    };
-    Ok((carrier, Some(options)))
+    })
+}
+
+/// Returns the rules of the carriers of a mapping, for [`Carriers`].
+#[must_use]
+pub fn carrier_rules(mapping: &Arc<Mapping>) -> Box<dyn CarrierRules> {
+    Box::new(LiveRoutes::new(mapping, None))
+}
+
+/// The rules of a program that sends nothing.
+#[derive(Debug)]
+struct NoRoutes;
+
+impl CarrierRules for NoRoutes {
+    fn sent(&mut self, _: &[u8]) {}
+
+    fn judge(&mut self, _: &[u8], _: MessagePath) -> Judgement {
+        Judgement::default()
+    }
 }
 
 /// Returns the broker of the command line, else that of the mapping. The address of the command
@@ -76,14 +146,26 @@ fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Op
         })?,
         None => pubsub.address,
     };
+    let group = UdpGroup {
+        address,
+        interface: pubsub.interface.clone(),
+        ttl: pubsub.ttl,
+    };
+    udp_options(arguments, &group, several)
+}
+
+/// Returns the socket options for a group. The interface of the command line takes precedence.
+fn udp_options(arguments: &Arguments, group: &UdpGroup, several: bool) -> Result<Options, Failure> {
+    let UdpGroup {
+        address,
+        interface,
+        ttl,
+    } = group;
+    let flag = arguments.flags.interface.clone();
     let options = Options {
-        interface: arguments
-            .flags
-            .interface
-            .clone()
-            .or_else(|| pubsub.interface.clone()),
-        ttl: u32::from(pubsub.ttl),
-        ..Options::new(address)
+        interface: flag.or_else(|| interface.clone()),
+        ttl: u32::from(*ttl),
+        ..Options::new(*address)
     };
     if several && !address.ip().is_multicast() {
         let message = format!(

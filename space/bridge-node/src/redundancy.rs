@@ -51,6 +51,9 @@ pub(crate) fn check(flags: &Flags, mapping: &Mapping, spaces: &[SpaceId]) -> Res
         Some(url) => is_mqtt(url),
         None => mapping.pubsub().broker.is_some(),
     };
+    if flags.address.is_none() && !mapping.pubsub().carriers.is_empty() {
+        return refuse("redundant bridges need one carrier, UDP multicast; list no other");
+    }
     if is_broker {
         return refuse("redundant bridges need UDP multicast, and the group is an MQTT broker");
     }

@@ -2,6 +2,7 @@
 
 mod awaited;
 mod calls;
+mod network;
 mod outbox;
 mod redundancy;
 mod taps;
@@ -14,15 +15,13 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, Notice, Output, Owned, Reason, Relay, Router};
+use bridge_core::{Heard, Notice, Output, Owned, Reason, Router};
 use bytes::Bytes;
-use mappings::{Mapping, SpaceId, TopicId};
+use mappings::{Mapping, PubSub, SpaceId, TopicId};
 use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, MissedTickBehavior, Sleep, interval};
 use tracing::{debug, info, warn};
-use transport::{
-    BUFFER, Carrier, CarrierChange, Finding, Held, Outgoing, Received, SendError, Senders,
-};
+use transport::{BUFFER, Carrier, Finding, Held, Outgoing, Received, SendError};
 use uadp::Timestamp;
 
 use crate::awaited::PeerWatch;
@@ -39,6 +38,7 @@ use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, RedundancyStatus, Status};
 use crate::tap::Taps;
 
+pub(crate) use network::relay;
 pub(crate) use outbox::Outbox;
 use outbox::Parcel;
 
@@ -106,6 +106,16 @@ impl Fixed {
     /// Returns the keys of `mapping` that differ from the running settings.
     fn differing(&self, mapping: &Mapping) -> Vec<String> {
         let (was, is) = (self.started.pubsub(), mapping.pubsub());
+        let media = |of: &PubSub| -> Vec<_> {
+            let carriers = of.carriers.iter();
+            carriers.map(|carrier| carrier.medium.clone()).collect()
+        };
+        let listed = (media(was), media(is));
+        let is_listed = !(listed.0.is_empty() && listed.1.is_empty());
+        if is_listed && self.address {
+            let differs = listed.0 != listed.1;
+            return differs.then(|| "pubsub".to_owned()).into_iter().collect();
+        }
         let keys = [
             ("pubsub.address", self.address && was.address != is.address),
             (
@@ -271,9 +281,8 @@ impl<P: Port> Shell<P> {
 
     fn status(&self) -> Status {
         let about = Arc::clone(&self.changes.borrow().about);
-        let lost = self.carrier.lost().map(group_lost);
         let interfaces = Interfaces {
-            pubsub: u8::from(lost.is_none()),
+            pubsub: u8::from(self.carrier.lost().is_none()),
             local: self
                 .held
                 .as_ref()
@@ -285,9 +294,10 @@ impl<P: Port> Shell<P> {
             &self.router,
             (&about, &self.restart),
             Readiness {
-                not_ready: [lost, side_lost, self.port.hindrance()]
-                    .into_iter()
-                    .flatten()
+                not_ready: self
+                    .lost_carriers()
+                    .chain(side_lost)
+                    .chain(self.port.hindrance())
                     .chain(self.taken.values().cloned())
                     .chain(self.keyless())
                     .chain(self.redundancy_faults())
@@ -302,6 +312,7 @@ impl<P: Port> Shell<P> {
         .with_certificate(self.port.certificate())
         .with_pending(self.port.pending())
         .with_carrier(self.carrier.interface(), self.carrier.dropped())
+        .with_carriers(self.carrier.states())
         .with_redundancy(RedundancyStatus::of(&self.router, now().monotonic))
     }
 
@@ -310,34 +321,6 @@ impl<P: Port> Shell<P> {
         let groups = self.router.groups();
         let keyless = groups.filter(|state| state.token_id.is_none());
         keyless.map(|state| format!("no keys of the group `{}` yet", state.group))
-    }
-
-    /// Follows the changes of the network interface of the group.
-    fn follow_group(&mut self) {
-        match self.carrier.follow() {
-            None => {}
-            Some(CarrierChange::Lost(why)) => {
-                let lost = group_lost(why);
-                warn!(
-                    "{lost}; this program waits for the network and transfers nothing until then"
-                );
-            }
-            Some(CarrierChange::Back(interface)) => {
-                if let Some(source) = self.carrier.source() {
-                    self.router.set_source(source);
-                }
-                // The probes of the start may have been lost.
-                self.router.call_the_roll(now());
-                info!(%interface, "the PubSub network is within reach again: sending and receiving");
-            }
-        }
-        let late = self.carrier.overflowed();
-        if late > 0 {
-            let why = "messages of another program of this process were not received in time";
-            self.router.dropped(Reason::Overflow, late, why);
-        }
-        // A broker may have another limit after each connection.
-        self.router.set_relay(relay(self.carrier.as_ref()));
     }
 
     /// Checks the network interfaces of the local side; fails if the local side cannot follow a
@@ -410,6 +393,8 @@ impl<P: Port> Shell<P> {
                 let now = now();
                 self.busy.arrived(now.monotonic);
                 self.observe(|observer| observer.datagram(datagram, from));
+                let (relay, forwarding) = network::arrival(self.carrier.as_ref());
+                self.router.set_arrival(relay, forwarding);
                 self.router.handle_datagram(datagram, from, now);
             }
             // Probably an ICMP error for a unicast peer; the socket stays usable.
@@ -678,21 +663,6 @@ impl<P: Port> Shell<P> {
             self.router.handed(topic, instance, handover);
         }
     }
-}
-
-/// Returns the properties of the broker, if the carrier uses one.
-pub(crate) fn relay(carrier: &dyn Carrier) -> Option<Relay> {
-    Some(Relay {
-        within: carrier.within()?,
-        authorized: carrier.senders() == Senders::Authorized,
-        limit: carrier
-            .limit()
-            .map(|limit| u16::try_from(limit).unwrap_or(u16::MAX)),
-    })
-}
-
-fn group_lost(why: String) -> String {
-    format!("the PubSub network is out of reach: {why}")
 }
 
 fn side_lost(why: String) -> String {

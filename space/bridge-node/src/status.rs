@@ -1,5 +1,6 @@
 //! The status of a program: counters per topic and delays per hop, as JSON and for Prometheus.
 
+mod carriers;
 mod redundancy;
 
 use std::collections::BTreeMap;
@@ -10,6 +11,7 @@ use bridge_core::{CallCounters, Counters, Delays, Hop, Reason, Router};
 use mappings::{SpaceId, Variable};
 use serde::Serialize;
 
+use self::carriers::CarrierStatus;
 pub(crate) use self::redundancy::RedundancyStatus;
 use crate::mapping_file::About;
 use crate::metrics::Told;
@@ -48,6 +50,8 @@ pub(crate) struct Status {
     /// The MQTT broker; `None` with UDP.
     #[serde(skip_serializing_if = "Option::is_none")]
     broker: Option<BrokerStatus>,
+    /// The carriers in the order of the mapping.
+    carriers: Vec<CarrierStatus>,
     /// The role among the redundant bridges of the space; `None` without redundancy.
     #[serde(skip_serializing_if = "Option::is_none")]
     redundancy: Option<RedundancyStatus>,
@@ -220,6 +224,7 @@ impl Status {
             cancellations_pending: Vec::new(),
             applications: applications(router),
             broker: None,
+            carriers: Vec::new(),
             redundancy: None,
             others: router.others().into(),
             hops,
@@ -269,6 +274,11 @@ impl Status {
             address,
             dropped: dropped.into_iter().collect(),
         });
+        self
+    }
+
+    pub(crate) fn with_carriers(mut self, states: Vec<transport::CarrierState>) -> Self {
+        self.carriers = states.into_iter().map(CarrierStatus::from).collect();
         self
     }
 
@@ -388,6 +398,9 @@ impl Told for Status {
         for (topic, call) in &self.calls {
             let labels = format!("{own},call=\"{topic}\"");
             call.figures(&labels, &mut line);
+        }
+        for carrier in &self.carriers {
+            carrier.figures(&own, &mut line);
         }
         for (reason, count) in self.broker.iter().flat_map(|broker| &broker.dropped) {
             let labels = format!("{own},reason=\"{reason}\"");

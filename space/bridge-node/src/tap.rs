@@ -170,6 +170,10 @@ enum Step<'a> {
         sequence: Option<u16>,
         keep_alive: bool,
     },
+    Forwarded {
+        #[serde(skip_serializing_if = "Option::is_none")]
+        refused: Option<&'static str>,
+    },
     Published {
         after_us: f64,
     },
@@ -200,6 +204,7 @@ impl<'a> Step<'a> {
                 sequence: *sequence,
                 keep_alive: *keep_alive,
             },
+            Crossing::Forwarded { refused } => Self::Forwarded { refused: *refused },
             Crossing::Published { after } => Self::Published {
                 after_us: microseconds(*after),
             },

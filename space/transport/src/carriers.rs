@@ -344,6 +344,11 @@ impl Carrier for Carriers {
         states.collect()
     }
 
+    fn overflowed(&mut self) -> u64 {
+        let members = self.members.iter_mut();
+        members.map(|member| member.carrier.overflowed()).sum()
+    }
+
     fn close(&mut self) {
         for member in &mut self.members {
             member.carrier.close();

@@ -339,6 +339,10 @@ impl Event {
                     None => format!("{kind} from {from}"),
                 }
             }
+            "forwarded" => match self.text_of("refused") {
+                "" => "forwarded to another carrier".to_owned(),
+                reason => harmless(reason),
+            },
             "published" => {
                 let after = self.more.get("after_us").and_then(Value::as_f64);
                 format!(
@@ -394,6 +398,14 @@ mod tests {
             (
                 r#"{"space":1,"at_us":0,"step":"sent","repeated":true}"#,
                 "repeated",
+            ),
+            (
+                r#"{"space":1,"at_us":0,"step":"forwarded"}"#,
+                "forwarded to another carrier",
+            ),
+            (
+                r#"{"space":1,"at_us":0,"step":"forwarded","refused":"not_forwarded_late"}"#,
+                "not_forwarded_late",
             ),
             (
                 r#"{"space":1,"at_us":0,"step":"received","from":"10.0.0.5:4840","sequence":17,"keep_alive":false}"#,

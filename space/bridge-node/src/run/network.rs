@@ -1,0 +1,84 @@
+//! The PubSub network of the run loop: its changes, and its properties for the Router.
+
+use bridge_core::{Forwarding, Reason, Relay};
+use tracing::{info, warn};
+use transport::{Arrival, Carrier, CarrierChange, Senders};
+
+use super::Shell;
+use crate::clock::now;
+use crate::port::Port;
+
+impl<P: Port> Shell<P> {
+    /// Follows the changes of the network interface of the group.
+    pub(super) fn follow_group(&mut self) {
+        match self.carrier.follow() {
+            None => {}
+            Some(CarrierChange::Lost(why)) => {
+                let lost = group_lost(why);
+                match self.carrier.lost() {
+                    Some(_) => warn!(
+                        "{lost}; this program waits for the network and transfers nothing until then"
+                    ),
+                    None => warn!("{lost}; the other carriers continue"),
+                }
+            }
+            Some(CarrierChange::Back(interface)) => {
+                if let Some(source) = self.carrier.source() {
+                    self.router.set_source(source);
+                }
+                // The probes of the start may have been lost.
+                self.router.call_the_roll(now());
+                info!(%interface, "the PubSub network is within reach again: sending and receiving");
+            }
+        }
+        let late = self.carrier.overflowed();
+        if late > 0 {
+            let why = "messages of another program of this process were not received in time";
+            self.router.dropped(Reason::Overflow, late, why);
+        }
+        // A broker may have another limit after each connection.
+        self.router.set_relay(relay(self.carrier.as_ref()));
+    }
+
+    /// Returns the reasons why carriers are out of reach.
+    pub(super) fn lost_carriers(&self) -> impl Iterator<Item = String> + use<P> {
+        let states = self.carrier.states().into_iter();
+        states.filter_map(|state| state.lost).map(group_lost)
+    }
+}
+
+/// Returns the properties of the broker, if the carrier uses one.
+pub(crate) fn relay(carrier: &dyn Carrier) -> Option<Relay> {
+    let limit = carrier.limit();
+    Some(Relay {
+        within: carrier.within()?,
+        authorized: carrier.senders() == Senders::Authorized,
+        limit: limit.map(|limit| u16::try_from(limit).unwrap_or(u16::MAX)),
+    })
+}
+
+/// Returns the properties of the broker by which the last message was received, `None` if it was
+/// not received from a broker, and its forwarding.
+pub(super) fn arrival(carrier: &dyn Carrier) -> (Option<Relay>, Forwarding) {
+    let Arrival {
+        senders,
+        within,
+        is_forwarded,
+        not_forwarded,
+    } = carrier.arrival();
+    let relay = within.map(|within| Relay {
+        within,
+        authorized: senders == Senders::Authorized,
+        limit: None,
+    });
+    let forwarding = match not_forwarded {
+        Some(reason) => Forwarding::Refused(reason),
+        None if is_forwarded => Forwarding::Forwarded,
+        None => Forwarding::None,
+    };
+    (relay, forwarding)
+}
+
+fn group_lost(why: String) -> String {
+    format!("the PubSub network is out of reach: {why}")
+}
