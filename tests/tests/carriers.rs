@@ -1,13 +1,15 @@
-//! The carriers: each passes the same tests, UDP multicast and an MQTT broker.
+//! The carriers: each passes the same tests, UDP multicast, an MQTT broker, and both together.
 
 use std::process::Command;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bridge_node::carrier_rules;
 use broker::{Identity, Mqtt};
-use mappings::{Broker, BrokerAddress, MqttVersion, PubSub};
+use mappings::{Broker, BrokerAddress, Mapping, MqttVersion, PubSub};
 use system_tests::{BROKER, Cell, Child, GROUP, HERE, Peer, UadpSocket, WIRE};
 use tokio::time::timeout;
-use transport::{BUFFER, Carrier, Options, Outgoing, SendError, Udp};
+use transport::{BUFFER, Carrier, Carriers, Options, Outgoing, SendError, Udp};
 use uadp::{
     DataSetHeader, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder, PublisherId,
     Scalar, Variant,
@@ -75,6 +77,31 @@ impl Network for Mosquitto<'_> {
 
     fn mend(&mut self) {
         self.broker = Some(self.cell.mosquitto());
+    }
+}
+
+/// Programs with both carriers.
+struct Both<'c> {
+    udp: Multicast,
+    mqtt: Mosquitto<'c>,
+}
+
+impl Network for Both<'_> {
+    fn join(&self, publisher: u16) -> Box<dyn Carrier> {
+        let text = format!("pubsub: [{{udp: {{}}}}, {{mqtt: {{address: \"{BROKER}\"}}}}]");
+        let mapping = Mapping::from_yaml(&text, "cell.yaml").mapping.unwrap();
+        let members = vec![self.udp.join(publisher), self.mqtt.join(publisher)];
+        Box::new(Carriers::new(members, carrier_rules(&Arc::new(mapping))))
+    }
+
+    fn cut(&mut self) {
+        self.udp.cut();
+        self.mqtt.cut();
+    }
+
+    fn mend(&mut self) {
+        self.udp.mend();
+        self.mqtt.mend();
     }
 }
 
@@ -171,8 +198,17 @@ fn send(
     carrier.try_send(&Outgoing::new(&value(publisher, number, padding)))
 }
 
-/// Runs the suite. `loses` is true for a network that may drop messages of a burst.
-async fn conforms(network: &mut dyn Network, loses: bool) {
+/// The faults of a network that the suite allows.
+#[derive(Clone, Copy)]
+struct Faults {
+    /// Messages of a burst may be lost.
+    loses: bool,
+    /// Messages of a burst may arrive in another order.
+    reorders: bool,
+}
+
+/// Runs the suite.
+async fn conforms(network: &mut dyn Network, Faults { loses, reorders }: Faults) {
     let (mut a, mut b, mut c) = (network.join(1), network.join(2), network.join(3));
     meet(a.as_mut(), 1, &mut [&mut b, &mut c]).await;
 
@@ -221,7 +257,8 @@ async fn conforms(network: &mut dyn Network, loses: bool) {
         let next = timeout(Duration::from_millis(100), numbers(b.as_mut(), 1, number)).await;
         if let Ok(got) = next {
             let of_flood = got.iter().filter(|number| (1000..21_000).contains(*number));
-            assert!(of_flood.clone().is_sorted(), "the order is kept");
+            let is_kept = reorders || of_flood.clone().is_sorted();
+            assert!(is_kept, "the order is kept");
             assert!(loses || of_flood.count() > 0, "the flood arrives in part");
             break;
         }
@@ -272,7 +309,11 @@ fn udp_multicast_conforms() {
     let Some(_cell) = Cell::with(&[]) else {
         return;
     };
-    run(conforms(&mut Multicast, true));
+    let faults = Faults {
+        loses: true,
+        reorders: false,
+    };
+    run(conforms(&mut Multicast, faults));
 }
 
 fn mosquitto_conforms(version: MqttVersion) {
@@ -285,7 +326,73 @@ fn mosquitto_conforms(version: MqttVersion) {
         version,
         broker,
     };
-    run(conforms(&mut network, false));
+    let faults = Faults {
+        loses: false,
+        reorders: false,
+    };
+    run(conforms(&mut network, faults));
+}
+
+/// Returns a network with both carriers.
+fn both(cell: &Cell) -> Both<'_> {
+    Both {
+        udp: Multicast,
+        mqtt: Mosquitto {
+            cell,
+            version: MqttVersion::V5,
+            broker: Some(cell.mosquitto()),
+        },
+    }
+}
+
+#[test]
+fn udp_and_mqtt_together_conform_and_deliver_each_message_once() {
+    let Some(cell) = Cell::with(&[Peer::Mosquitto]) else {
+        return;
+    };
+    // The broker delivers messages of a burst that UDP has lost, later than the next messages.
+    let faults = Faults {
+        loses: true,
+        reorders: true,
+    };
+    run(conforms(&mut both(&cell), faults));
+}
+
+#[test]
+fn a_dead_broker_does_not_stop_udp_beside_it() {
+    let Some(cell) = Cell::with(&[Peer::Mosquitto]) else {
+        return;
+    };
+    let mut network = both(&cell);
+    run(async {
+        let (mut a, mut b) = (network.join(1), network.join(2));
+        meet(a.as_mut(), 1, &mut [&mut b]).await;
+        network.mqtt.cut();
+        for number in 0..200 {
+            send(a.as_mut(), 1, number, 0).unwrap();
+            if number % 50 == 49 {
+                let got = numbers(b.as_mut(), 1, number).await;
+                let got: Vec<u32> = got.into_iter().filter(|of| *of != WARM_UP).collect();
+                assert_eq!(got, (number - 49..=number).collect::<Vec<_>>());
+            }
+        }
+        until(SOON, || {
+            let _change = a.follow();
+            a.states().iter().any(|state| state.lost.is_some())
+        })
+        .await;
+        assert_eq!(a.lost(), None);
+        let states = a.states();
+        let lost: Vec<bool> = states.iter().map(|state| state.lost.is_some()).collect();
+        assert_eq!(lost, [false, true]);
+        send(a.as_mut(), 1, 200, 0).unwrap();
+        numbers(b.as_mut(), 1, 200).await;
+        let unsent = a.states()[1]
+            .dropped
+            .iter()
+            .any(|(reason, count)| *reason == "not_sent_unreachable" && *count > 0);
+        assert!(unsent, "{states:?}");
+    });
 }
 
 #[test]

@@ -1,5 +1,5 @@
-//! The space over an MQTT broker: values, discovery, secured groups and TLS, and commands that a
-//! broker could deliver late.
+//! The space over an MQTT broker: values, discovery, secured groups and TLS, commands that a broker
+//! could deliver late, and programs that forward between UDP and a broker.
 
 use std::path::Path;
 use std::process::Command;
@@ -312,6 +312,115 @@ fn a_command_is_never_delivered_late_by_a_broker() {
     drop(bridge);
     assert_eq!(commanded.write(1007.0), "BadTimeout");
     let _bridge = cell.bridge_ros1(&[mapping]);
+    commanded.never_arrives(1007.0);
+    commanded.arrives();
+}
+
+/// The carriers of the program between UDP and the broker.
+const BETWEEN: &str = "
+pubsub:
+  - udp: {}
+    forward: [ua_1_5_10, ua_0]
+  - mqtt: {address: \"mqtt://127.0.0.1:1883\"}
+    forward: [ua_2_5, ua_1_2]
+spaces: [{id: 1}, {id: 2}]
+namespaces: {2: urn:ua-bridge:system-tests}
+server: {security: [None]}
+";
+
+/// Returns the number of forwarded messages and the drops of each carrier.
+fn carriers(metrics_address: &str) -> Vec<(u64, Value)> {
+    let status = metrics(metrics_address).unwrap_or_default();
+    let all = status["carriers"].as_array().into_iter().flatten();
+    all.map(|of| {
+        (
+            of["forwarded"].as_u64().unwrap_or_default(),
+            of["dropped"].clone(),
+        )
+    })
+    .collect()
+}
+
+#[test]
+fn a_topic_is_forwarded_from_udp_to_a_broker_and_reloaded_routes_end_it() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Mosquitto]) else {
+        return;
+    };
+    let _broker = cell.mosquitto();
+    let _master = cell.roscore();
+    let mapping = cell.file("between.yaml", BETWEEN);
+    let mut server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    let _ros1 = cell.bridge_ros1(&[]);
+    let _ros2 = cell.bridge_ros2(&OVER_MQTT);
+    let (_sends, mut receives) = ends(&cell, "over both");
+    arrives(&mut receives, "over both");
+    let both: [(u64, Value); 2] = carriers(METRICS_SERVER).try_into().unwrap();
+    let [(to_udp, _), (to_broker, _)] = both;
+    assert!(to_broker > 0, "{to_udp} {to_broker}");
+    // Nothing goes round in a circle: each value is delivered once.
+    let status = metrics(METRICS_ROS2).unwrap();
+    let topic = &status["topics"]["ua_1_5_10"];
+    assert!(topic["sender_changed"] == 0, "{topic}");
+    let (ros1, other) = (metrics(METRICS_ROS1).unwrap(), "space_taken");
+    assert!(ros1["others"]["dropped"].get(other).is_none(), "{ros1}");
+
+    cell.file("between.yaml", &BETWEEN.replace("ua_1_5_10, ", ""));
+    server.signal(Signal::SIGHUP);
+    eventually("the route ends", SOON, || {
+        let before = delivered();
+        let start = carriers(METRICS_SERVER).get(1)?.0;
+        holds_for("values are sent", Duration::from_secs(1), || true);
+        (delivered() == before && carriers(METRICS_SERVER).get(1)?.0 == start).then_some(())
+    });
+    cell.file("between.yaml", BETWEEN);
+    server.signal(Signal::SIGHUP);
+    let before = delivered();
+    eventually("the route begins again", SOON, || {
+        (delivered() > before).then_some(())
+    });
+    assert!(server.end().success());
+}
+
+#[test]
+fn a_command_crosses_from_udp_to_a_broker_and_is_never_late() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Mosquitto]) else {
+        return;
+    };
+    let broker = cell.mosquitto();
+    let _master = cell.roscore();
+    let over_mqtt = cell.file("command.yaml", COMMAND);
+    let over_mqtt = over_mqtt.to_str().unwrap();
+    let (_, common) = COMMAND.split_once("1883\"}\n").unwrap();
+    let over_udp = cell.file("udp.yaml", common);
+    let (_, variables) = common.split_once("variables:").unwrap();
+    let between =
+        format!("{BETWEEN}variables:{variables}").replacen("server: {security: [None]}\n", "", 1);
+    let between = cell.file("between.yaml", &between);
+    let _server = cell.ua_server(&[over_udp.to_str().unwrap()]);
+    eventually("the server answers clients", SOON, || {
+        cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
+    });
+    let bridge = cell.bridge_ros1(&[over_mqtt]);
+    let _between = cell.bridge_ros2(&[between.to_str().unwrap()]);
+    let robot = cell.rospy("ros1_arm.py", &["/arm/setpoint", "/arm/reached"]);
+    let mut commanded = Commanded {
+        cell: &cell,
+        robot,
+        value: 0.0,
+    };
+    commanded.arrives();
+
+    // The broker is stopped for a time in which its clients may stay.
+    broker.signal(Signal::SIGSTOP);
+    assert_eq!(commanded.write(1002.0), "BadTimeout");
+    broker.signal(Signal::SIGCONT);
+    commanded.never_arrives(1002.0);
+    commanded.arrives();
+
+    // The reader is absent.
+    drop(bridge);
+    assert_eq!(commanded.write(1007.0), "BadTimeout");
+    let _bridge = cell.bridge_ros1(&[over_mqtt]);
     commanded.never_arrives(1007.0);
     commanded.arrives();
 }
