@@ -23,6 +23,8 @@ pub struct Broker {
     pub within: Duration,
     /// Whether the access rules of the broker decide who may request calls.
     pub acl: bool,
+    /// Whether the broker reports the loss of the program, which then alone uses its PublisherId.
+    pub will: bool,
     /// Certificates of authorities, as PEM; `None`: those of the system.
     pub ca: Option<PathBuf>,
     /// Own certificate and key, as PEM.
@@ -97,6 +99,7 @@ impl Broker {
             at_least_once: false,
             within: Self::WITHIN,
             acl: false,
+            will: false,
             ca: None,
             client: None,
             credentials: None,

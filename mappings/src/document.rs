@@ -144,6 +144,10 @@ document! {
         /// Whether the access rules of the broker decide who may request calls; default false: over a broker, calls need a
         /// secured group or `open: true`.
         acl: bool,
+        /// Whether the broker reports the loss of a bridge at once (an MQTT will); default false: readers
+        /// take a program as failed when its next status is overdue. Only if one program alone uses
+        /// each PublisherId; the programs of space 0 share theirs and have no will.
+        will: bool,
         /// PEM file with the certificates of authorities for mqtts://, relative to this file. Default: the authorities of the
         /// system.
         #[schemars(length(min = 1))]

@@ -11,6 +11,8 @@ use system_tests::{
     BROKER, Cell, Child, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, Peer, SERVER_ENDPOINT,
     Started, eventually, holds_for, http_answer, metrics, program,
 };
+use uadp::NetworkMessage;
+use uadp::discovery::{Announced, Announcement, ConnectionState};
 
 const SOON: Duration = Duration::from_secs(30);
 const TOPIC: [&str; 2] = ["/ua_1_5_10", "std_msgs/String"];
@@ -314,6 +316,54 @@ fn a_command_is_never_delivered_late_by_a_broker() {
     let _bridge = cell.bridge_ros1(&[mapping]);
     commanded.never_arrives(1007.0);
     commanded.arrives();
+}
+
+/// Returns the retained status of space 1.
+fn status_of_ros1() -> Option<ConnectionState> {
+    let output = Command::new("/usr/bin/mosquitto_sub")
+        .args(["-h", "127.0.0.1", "-t", "opcua/uadp/status/1"])
+        .args(["-C", "1", "-W", "2", "-F", "%x"])
+        .output()
+        .unwrap();
+    let hex = String::from_utf8(output.stdout).unwrap();
+    let bytes: Option<Vec<u8>> = (0..hex.trim().len())
+        .step_by(2)
+        .map(|at| u8::from_str_radix(hex.get(at..at + 2)?, 16).ok())
+        .collect();
+    let bytes = bytes?;
+    let message = NetworkMessage::decode(&bytes).ok()?;
+    let Announced::ApplicationStatus { state, .. } = Announcement::decode(&message).ok()?.announced
+    else {
+        return None;
+    };
+    Some(state)
+}
+
+#[test]
+fn a_broker_reports_a_killed_bridge_that_has_a_will() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Mosquitto]) else {
+        return;
+    };
+    let _broker = cell.mosquitto();
+    let _master = cell.roscore();
+    let text = format!("pubsub: {{address: \"{BROKER}\", mqtt: {{will: true}}}}\n");
+    let mapping = cell.file("will.yaml", &text);
+    let arguments = [mapping.to_str().unwrap()];
+    let status = |wanted: ConnectionState| {
+        eventually("the status", SOON, || {
+            (status_of_ros1()? == wanted).then_some(())
+        });
+    };
+    let killed = cell.bridge_ros1(&arguments);
+    status(ConnectionState::OPERATIONAL);
+    killed.signal(Signal::SIGKILL);
+    status(ConnectionState::ERROR);
+    drop(killed);
+
+    let mut ended = cell.bridge_ros1(&arguments);
+    status(ConnectionState::OPERATIONAL);
+    assert!(ended.end().success());
+    status(ConnectionState::DISABLED);
 }
 
 /// The carriers of the program between UDP and the broker.

@@ -78,6 +78,14 @@ pub(super) fn at(
     broker.at_least_once = within(&mqtt.qos, 0..=1, "for qos", findings) == Some(1);
     broker.within = duration(&mqtt.within, findings).unwrap_or(Broker::WITHIN);
     broker.acl = given(&mqtt.acl).is_some_and(|(set, _)| *set);
+    if let Some((true, place)) = given(&mqtt.will) {
+        broker.will = broker.encoding == MessageMapping::Uadp;
+        if !broker.will {
+            let message = "a connection has one will, and with JSON there are two statuses";
+            let note = findings.error(Code::WrongValue, place, message);
+            note.help("remove `will`, or use `encoding: uadp`");
+        }
+    }
     files(mqtt, &mut broker, findings);
     Some(Box::new(broker))
 }

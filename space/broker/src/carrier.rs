@@ -64,6 +64,7 @@ impl Mqtt {
     pub fn open(broker: &Broker, identity: &Identity) -> Result<Self, OpenError> {
         let settings = Arc::new(Settings::read(broker, identity)?);
         let shared = Arc::new(Shared::default());
+        let reports = Reports::new(settings.will.is_some());
         let (out, received) = mpsc::channel(MAX_RECEIVED);
         // The task ends when the carrier is closed or dropped.
         drop(tokio::spawn(run(
@@ -78,7 +79,7 @@ impl Mqtt {
             ready: VecDeque::new(),
             producers: Producers::default(),
             echo: Echo::default(),
-            reports: Reports::default(),
+            reports,
             json: Json::new(broker.encoding),
             dropped: BTreeMap::new(),
             connected: None,

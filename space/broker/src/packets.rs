@@ -9,7 +9,7 @@ use mqtt_protocol_core::mqtt::packet::{
 use mqtt_protocol_core::mqtt::result_code::MqttError;
 
 use crate::queue::Publication;
-use crate::settings::Settings;
+use crate::settings::{Settings, Will};
 
 /// A received publication.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -36,6 +36,9 @@ pub(crate) fn connect(settings: &Settings, version: MqttVersion) -> Result<Packe
                 .client_id(id)?
                 .clean_session(true)
                 .keep_alive(KEEP_ALIVE);
+            if let Some(Will { topic, payload }) = &settings.will {
+                connect = connect.will_message(topic.as_str(), payload, Qos::AtLeastOnce, true)?;
+            }
             if let Some(login) = login {
                 connect = connect
                     .user_name(login.user.as_str())?
@@ -50,6 +53,9 @@ pub(crate) fn connect(settings: &Settings, version: MqttVersion) -> Result<Packe
                 .clean_start(true)
                 .keep_alive(KEEP_ALIVE)
                 .props(vec![Property::MaximumPacketSize(limit)]);
+            if let Some(Will { topic, payload }) = &settings.will {
+                connect = connect.will_message(topic.as_str(), payload, Qos::AtLeastOnce, true)?;
+            }
             if let Some(login) = login {
                 connect = connect
                     .user_name(login.user.as_str())?

@@ -15,6 +15,8 @@ use crate::topics::Address;
 #[derive(Debug, Default)]
 pub(crate) struct Reports {
     next_status: Option<Instant>,
+    /// Whether the broker reports the end of the program, so that the status is not cyclic.
+    has_will: bool,
     sequence: u16,
     /// Retained topics of the own PublisherId that this run did not publish, and the time at which
     /// they are cleared.
@@ -26,6 +28,18 @@ pub(crate) struct Reports {
 }
 
 impl Reports {
+    pub(crate) fn new(has_will: bool) -> Self {
+        Self {
+            has_will,
+            ..Self::default()
+        }
+    }
+
+    /// Returns the status of a program that failed.
+    pub(crate) fn failed(&mut self, publisher: u16) -> Option<Vec<u8>> {
+        self.encode(publisher, ConnectionState::ERROR, None)
+    }
+
     /// Returns the status to publish, if it is due.
     pub(crate) fn status(
         &mut self,
@@ -34,6 +48,11 @@ impl Reports {
     ) -> Option<Vec<u8>> {
         if self.next_status.is_some_and(|next| next > now) {
             return None;
+        }
+        if self.has_will {
+            // A broker may have lost the retained status.
+            self.next_status = Some(now + STATUS_REPEATED);
+            return self.encode(publisher, ConnectionState::OPERATIONAL, None);
         }
         self.next_status = Some(now + STATUS_PERIOD);
         let period = i64::try_from(STATUS_PERIOD.as_nanos() / 100).unwrap_or(i64::MAX);
@@ -174,6 +193,8 @@ type NamedGroup = (u16, String, Vec<(u16, String)>);
 
 /// The interval of the status.
 const STATUS_PERIOD: Duration = Duration::from_secs(2);
+/// The interval of a status that is not cyclic.
+const STATUS_REPEATED: Duration = Duration::from_secs(30);
 /// The time in which a program announces its topics after its start.
 const STRAY: Duration = Duration::from_secs(60);
 const MAX_STRAYS: usize = 16_384;
@@ -188,6 +209,23 @@ mod tests {
 
     use super::*;
     use crate::topics::MessageType;
+
+    #[test]
+    #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
+    fn a_program_with_a_will_has_no_cyclic_status() {
+        let (now, utc) = (Instant::now(), Timestamp::from_unix_nanos(0));
+        for has_will in [false, true] {
+            let mut reports = Reports::new(has_will);
+            let bytes = reports.status(1, (now, utc)).unwrap();
+            let status = NetworkMessage::decode(&bytes).unwrap();
+            let (state, cyclic) = crate::address::status(&status).unwrap();
+            assert_eq!(state, ConnectionState::OPERATIONAL);
+            assert_eq!(cyclic.is_some(), !has_will);
+            let next = reports.status(1, (now + STATUS_PERIOD, utc));
+            assert_eq!(next.is_some(), !has_will);
+            assert!(reports.status(1, (now + STATUS_REPEATED, utc)).is_some());
+        }
+    }
 
     #[test]
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]

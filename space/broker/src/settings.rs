@@ -12,6 +12,9 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, InvalidDnsNameError, PrivateKeyDer, ServerName};
 use rustls::{ClientConfig, RootCertStore, crypto};
 
+use crate::reports::Reports;
+use crate::topics::{self, Address, MessageType, UADP};
+
 /// The program that uses a broker.
 #[derive(Debug, Clone)]
 pub struct Identity {
@@ -57,6 +60,13 @@ pub(crate) struct Settings {
     pub(crate) publisher: Option<u16>,
     pub(crate) credentials: Option<Credentials>,
     pub(crate) tls: Option<Tls>,
+    pub(crate) will: Option<Will>,
+}
+
+/// The status that the broker publishes when the connection is lost.
+pub(crate) struct Will {
+    pub(crate) topic: String,
+    pub(crate) payload: Vec<u8>,
 }
 
 /// User name and password of an MQTT client.
@@ -81,8 +91,25 @@ impl Settings {
             publisher: identity.publisher,
             credentials,
             tls,
+            will: will(broker, identity),
         })
     }
+}
+
+/// Returns the will of a program that alone uses its PublisherId. The programs of space 0 share
+/// theirs.
+fn will(broker: &Broker, identity: &Identity) -> Option<Will> {
+    let publisher = identity.publisher.filter(|of| broker.will && *of != 0)?;
+    let address = Address {
+        kind: MessageType::Status,
+        publisher,
+        group: None,
+        writer: None,
+    };
+    Some(Will {
+        topic: topics::name(broker, UADP, address),
+        payload: Reports::default().failed(publisher)?,
+    })
 }
 
 /// Returns a ClientId that no other client has. The broker disconnects the older of two clients
