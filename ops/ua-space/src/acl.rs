@@ -10,16 +10,52 @@ use crate::arguments::Acl;
 use crate::exit::Failure;
 use crate::live::broker_mapping;
 
-/// Prints the `acl_file` of mosquitto.
+/// Prints the `acl_file` of mosquitto, or the permissions of NATS.
 pub(crate) fn acl(arguments: &Acl) -> Result<(), Failure> {
     let mapping = broker_mapping(&arguments.mapping)?;
-    let rules = rules(&mapping)?;
+    let users = users(&mapping)?;
+    let rules = match arguments.nats {
+        true => nats(&users),
+        false => mosquitto(&users),
+    };
     io::stdout().lock().write_all(rules.as_bytes())?;
     Ok(())
 }
 
-/// Returns the rules for a user of each space, and for a user that inspects.
-fn rules(mapping: &Mapping) -> Result<String, Failure> {
+/// A user of the broker, with filters of MQTT.
+struct BrokerUser {
+    name: String,
+    /// The programs that log in as the user.
+    programs: &'static str,
+    write: Vec<String>,
+    read: String,
+}
+
+impl BrokerUser {
+    /// Returns a user that may read everything, and request calls. A request and a probe have the
+    /// topic of the space that they are sent to.
+    fn new(name: impl Into<String>, programs: &'static str, prefix: &str) -> Self {
+        let shared = OF_ALL.iter().map(|kind| format!("{prefix}/uadp/{kind}/#"));
+        Self {
+            name: name.into(),
+            programs,
+            write: shared.collect(),
+            read: format!("{prefix}/#"),
+        }
+    }
+
+    /// Allows the user to write the messages of a space.
+    fn publishes(&mut self, space: SpaceId, (broker, mapping): (&Broker, &Mapping)) {
+        let prefix = &broker.prefix;
+        let kinds = OF_PUBLISHER.iter();
+        let kinds = kinds.map(|kind| format!("{prefix}/+/{kind}/{space}/#"));
+        self.write.extend(kinds);
+        self.write.extend(names(broker, mapping, space));
+    }
+}
+
+/// Returns a user of each space, a user that forwards, and a user that inspects.
+fn users(mapping: &Mapping) -> Result<Vec<BrokerUser>, Failure> {
     let Some(broker) = mapping.pubsub().broker.as_deref() else {
         let why =
             "the mapping names no broker; for example pubsub: {address: mqtt://broker.local:1883}";
@@ -28,46 +64,105 @@ fn rules(mapping: &Mapping) -> Result<String, Failure> {
     let prefix = &broker.prefix;
     let declared = mapping.spaces().iter().map(|space| space.id);
     let spaces: BTreeSet<SpaceId> = declared.chain([SpaceId::UA]).collect();
-    let mut text = String::from(
-        "# acl_file of mosquitto. Each user may write the messages of one space, so that a program\n\
-         # cannot send in the name of another. Set the passwords with mosquitto_passwd.\n",
-    );
+    let mut users = Vec::new();
     for space in spaces {
         let programs = match space {
             SpaceId::UA => "ua-server and the components",
             SpaceId::ROS1 => "bridge-ros1",
             _ => "bridge-ros2",
         };
-        // Writing to a string does not fail.
-        let _written = writeln!(text, "\n# {programs}\nuser space-{space}");
-        for kind in OF_PUBLISHER {
-            let _written = writeln!(text, "topic write {prefix}/+/{kind}/{space}/#");
-        }
-        for topic in names(broker, mapping, space) {
-            let _written = writeln!(text, "topic write {topic}");
-        }
-        shared(&mut text, prefix);
+        let mut user = BrokerUser::new(format!("space-{space}"), programs, prefix);
+        user.publishes(space, (broker, mapping));
+        users.push(user);
     }
     let forwarded = forwarded(mapping);
     if !forwarded.is_empty() {
-        let _written = writeln!(
-            text,
-            "\n# the program that forwards from the other carriers; add the rules of its own space\n\
-             user forwarder"
-        );
+        let programs = "the program that forwards from other carriers; add the rules of its space";
+        let mut user = BrokerUser::new("forwarder", programs, prefix);
         for space in forwarded {
-            for kind in OF_PUBLISHER {
-                let _written = writeln!(text, "topic write {prefix}/+/{kind}/{space}/#");
-            }
-            for topic in names(broker, mapping, space) {
-                let _written = writeln!(text, "topic write {topic}");
-            }
+            user.publishes(space, (broker, mapping));
         }
-        shared(&mut text, prefix);
+        users.push(user);
     }
-    let _written = writeln!(text, "\n# ua-space; may also request each call\nuser tools");
-    shared(&mut text, prefix);
-    Ok(text)
+    let tools = BrokerUser::new("tools", "ua-space; may also request each call", prefix);
+    users.push(tools);
+    Ok(users)
+}
+
+/// Returns the `acl_file` of mosquitto.
+fn mosquitto(users: &[BrokerUser]) -> String {
+    let mut text = String::from(
+        "# acl_file of mosquitto. Each user may write the messages of one space, so that a program\n\
+         # cannot send in the name of another. Set the passwords with mosquitto_passwd.\n",
+    );
+    for user in users {
+        // Writing to a string does not fail.
+        let _written = writeln!(text, "\n# {}\nuser {}", user.programs, user.name);
+        for filter in &user.write {
+            let _written = writeln!(text, "topic write {filter}");
+        }
+        let _written = writeln!(text, "topic read {}", user.read);
+    }
+    text
+}
+
+/// Returns the `authorization` of NATS, which turns topics into subjects.
+fn nats(users: &[BrokerUser]) -> String {
+    let mut text = String::from(
+        "# authorization of nats-server. Each user may write the messages of one space, so that a\n\
+         # program cannot send in the name of another. The passwords are environment variables.\n\
+         authorization {\n  users = [\n",
+    );
+    for BrokerUser {
+        name,
+        programs,
+        write,
+        read,
+    } in users
+    {
+        let variable = name.to_uppercase().replace('-', "_");
+        let publish: BTreeSet<String> = write.iter().flat_map(|filter| subjects(filter)).collect();
+        let publish = quoted(publish);
+        // The server delivers messages with QoS 1 by subjects of its own.
+        let subscribe = quoted(subjects(read).chain(["$MQTT.sub.>".to_owned()]));
+        let _written = write!(
+            text,
+            "    # {programs}\n    {{\n      user: \"{name}\",\n      password: ${variable}_PASSWORD,\n      \
+             permissions: {{\n        publish: [{publish}],\n        subscribe: [{subscribe}]\n      }}\n    }},\n"
+        );
+    }
+    text.push_str("  ]\n}\n");
+    text
+}
+
+/// Returns the subjects of a filter. `#` also stands for no level, and `>` for at least one.
+fn subjects(filter: &str) -> impl Iterator<Item = String> {
+    let (exact, below) = match filter.strip_suffix("/#") {
+        Some(above) => (subject(above), Some(format!("{}.>", subject(above)))),
+        None => (subject(filter), None),
+    };
+    std::iter::once(exact).chain(below)
+}
+
+fn subject(filter: &str) -> String {
+    let mut subject = String::with_capacity(filter.len());
+    for character in filter.chars() {
+        match character {
+            '.' => subject.push_str("//"),
+            '/' => subject.push('.'),
+            '+' => subject.push('*'),
+            other => subject.push(other),
+        }
+    }
+    subject
+}
+
+fn quoted(subjects: impl IntoIterator<Item = String>) -> String {
+    let quoted: Vec<String> = subjects
+        .into_iter()
+        .map(|subject| format!("\"{subject}\""))
+        .collect();
+    quoted.join(", ")
 }
 
 /// Returns the spaces of which other carriers forward messages to the first broker. Confirmations
@@ -78,15 +173,6 @@ fn forwarded(mapping: &Mapping) -> BTreeSet<SpaceId> {
     let others = carriers.filter(|carrier| !is_broker(&carrier.medium));
     let names = others.flat_map(|carrier| &carrier.forward);
     names.map(|name: &ForwardedName| name.space()).collect()
-}
-
-/// Adds the rules of all users. A request and a probe have the topic of the space that they are
-/// sent to.
-fn shared(text: &mut String, prefix: &str) {
-    for kind in OF_ALL {
-        let _written = writeln!(text, "topic write {prefix}/uadp/{kind}/#");
-    }
-    let _written = writeln!(text, "topic read {prefix}/#");
 }
 
 /// Returns the topics of the space, if values have the names of the space as topics: a wildcard
@@ -131,10 +217,10 @@ variables:
     #[test]
     fn each_space_may_write_its_own_topics_only() {
         let mapping = Mapping::from_yaml(CELL, "cell.yaml").mapping.unwrap();
-        let rules = rules(&mapping).unwrap();
-        let mut users = rules.split("\nuser ").skip(1);
+        let rules = mosquitto(&users(&mapping).unwrap());
+        let mut parts = rules.split("\nuser ").skip(1);
         for (name, own) in [("space-0", 0), ("space-1", 1), ("space-2", 2)] {
-            let user = users.next().unwrap();
+            let user = parts.next().unwrap();
             assert!(user.starts_with(name), "{user}");
             let data: Vec<&str> = user
                 .lines()
@@ -143,7 +229,7 @@ variables:
             assert_eq!(data, [format!("topic write cell/+/data/{own}/#")]);
             assert_eq!(user.contains("topic write cell/ua_2_5_10"), own == 2);
         }
-        let tools = users.next().unwrap();
+        let tools = parts.next().unwrap();
         assert!(!tools.contains("/data/") && !tools.contains("/discovery/"));
         assert!(tools.contains("topic read cell/#"));
     }
@@ -153,7 +239,7 @@ variables:
         let cell = "pubsub: [{udp: {}, forward: [ua_1_2, ua_1_3]}, {mqtt: {address: \"mqtt://b\"}, forward: [ua_2]}]\n\
                     spaces: [{id: 1}, {id: 2}]\n";
         let mapping = Mapping::from_yaml(cell, "cell.yaml").mapping.unwrap();
-        let rules = rules(&mapping).unwrap();
+        let rules = mosquitto(&users(&mapping).unwrap());
         let (_, forwarder) = rules.split_once("\nuser forwarder\n").unwrap();
         let (forwarder, _) = forwarder.split_once("\nuser ").unwrap();
         let written = "topic write opcua/+/data/1/#";
@@ -162,7 +248,25 @@ variables:
     }
 
     #[test]
+    fn subjects_of_nats_are_those_of_the_topics() {
+        let all = |filter| subjects(filter).collect::<Vec<_>>();
+        assert_eq!(all("cell/+/data/2/#"), ["cell.*.data.2", "cell.*.data.2.>"]);
+        assert_eq!(all("plant.a/ua_1_2_10"), ["plant//a.ua_1_2_10"]);
+        let mapping = Mapping::from_yaml(CELL, "cell.yaml").mapping.unwrap();
+        let rules = nats(&users(&mapping).unwrap());
+        let (_, user) = rules.split_once("user: \"space-1\"").unwrap();
+        let (user, _) = user.split_once("user: ").unwrap();
+        assert!(user.contains("password: $SPACE_1_PASSWORD,"), "{user}");
+        assert!(user.contains("\"cell.*.status.1\""), "{user}");
+        assert!(!user.contains("data.2"), "{user}");
+        assert!(
+            user.contains("subscribe: [\"cell\", \"cell.>\", \"$MQTT.sub.>\"]"),
+            "{user}"
+        );
+    }
+
+    #[test]
     fn a_mapping_without_a_broker_has_no_rules() {
-        assert!(rules(&Mapping::default()).is_err());
+        assert!(users(&Mapping::default()).is_err());
     }
 }

@@ -522,6 +522,9 @@ pub(crate) struct Acl {
     /// The mapping of the cell
     #[arg(value_name = "MAPPING")]
     pub(crate) mapping: PathBuf,
+    /// Print the authorization of nats-server instead
+    #[arg(long)]
+    pub(crate) nats: bool,
 }
 
 #[derive(Debug, Args)]
