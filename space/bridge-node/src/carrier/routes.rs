@@ -14,7 +14,8 @@ use std::time::{Duration, Instant};
 use bridge_core::{Now, is_aged};
 use broker::{MessageRole, MessageScope};
 use mappings::{
-    CarrierMedium, ConfiguredCarrier, ForwardedName, Lasting, Mapping, SpaceId, TopicId, Variable,
+    Broker, CarrierMedium, ConfiguredCarrier, ForwardedName, Lasting, Mapping, SpaceId, TopicId,
+    Variable,
 };
 use tokio::sync::watch;
 use transport::{CarrierRules, ForwardTo, Judgement, MessagePath};
@@ -159,12 +160,18 @@ impl Routes {
         }
         let content = self.content(&message, scope);
         let stores = self.ends.get(path.carrier).and_then(End::within);
-        let refused = match (sight, stores) {
+        // No receiver on UDP checks the age, and this program may have been stopped for a while.
+        let acts = content.is_command()
+            || matches!(scope.role, MessageRole::Request | MessageRole::HiddenCall);
+        let judged = stores.or((acts && self.has_udp(&carriers)).then_some(Broker::WITHIN));
+        let refused = match (sight, judged) {
             // A loop is at least this fast, and a repetition by a program is slower.
             (Sight::Repeated { since }, _) if since < LOOP => Some(LOOPED),
             // On UDP each repetition of a command has a new time, so that a broker could deliver
             // the command after it was given up.
-            (Sight::Repeated { .. }, None) if content.is_command() => Some(REPEATED),
+            (Sight::Repeated { .. }, _) if content.is_command() && stores.is_none() => {
+                Some(REPEATED)
+            }
             _ if !self.may_cross(&message, scope, path.carrier) => Some(NOT_AUTHORIZED),
             (_, Some(within)) => content.refuse(&message, scope, within, now.utc),
             (Sight::New | Sight::Copy | Sight::Repeated { .. }, None) => None,
@@ -192,6 +199,11 @@ impl Routes {
             }),
             ..Judgement::default()
         }
+    }
+
+    fn has_udp(&self, carriers: &[usize]) -> bool {
+        let mut ends = carriers.iter().filter_map(|to| self.ends.get(*to));
+        ends.any(|end| matches!(end.medium, CarrierMedium::Udp(_)))
     }
 
     /// Returns the carriers that a message of a carrier is forwarded to.

@@ -277,6 +277,28 @@ fn a_command_of_a_broker_counts_for_its_own_time() {
 }
 
 #[test]
+fn a_command_crosses_between_two_groups_only_in_time() {
+    let cell = CELL.replace(
+        "mqtt: {address: mqtt://broker.local}",
+        "udp: {address: opc.udp://239.192.0.41}",
+    );
+    let (mut routes, now) = (routes_of(&cell), start());
+    for (number, sent, age, refused) in [
+        (1, Some(now.utc), 500, None),
+        (2, Some(now.utc), 501, Some(LATE)),
+        (3, None, 0, Some(UNTIMED)),
+    ] {
+        let bytes = value((0, 2, 20), number, (sent, None));
+        let judgement = routes.judge(&bytes, path(UDP, 9), later(now, age));
+        assert_eq!(judgement.not_forwarded, refused, "{age} ms");
+    }
+    // The age of other values does not matter.
+    let state = value((1, 2, 10), 1, (Some(now.utc), None));
+    let judgement = routes.judge(&state, path(UDP, 9), later(now, 60_000));
+    assert_eq!(targets(&judgement), [1]);
+}
+
+#[test]
 fn requests_go_to_the_executor_and_responses_come_back() {
     let (mut routes, now) = (routes(), start());
     let call = (2, 5, 60);
