@@ -371,7 +371,7 @@ const BETWEEN: &str = "
 pubsub:
   - udp: {}
     forward: [ua_1_5_10, ua_0]
-  - mqtt: {address: \"mqtt://127.0.0.1:1883\"}
+  - mqtt: {address: \"mqtt://127.0.0.1:1883\", encoding: json-verbose}
     forward: [ua_2_5, ua_1_2]
 spaces: [{id: 1}, {id: 2}]
 namespaces: {2: urn:ua-bridge:system-tests}
@@ -392,7 +392,7 @@ fn carriers(metrics_address: &str) -> Vec<(u64, Value)> {
 }
 
 #[test]
-fn a_topic_is_forwarded_from_udp_to_a_broker_and_reloaded_routes_end_it() {
+fn a_topic_is_forwarded_from_udp_to_a_broker_as_json_and_reloaded_routes_end_it() {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Mosquitto]) else {
         return;
     };
@@ -407,6 +407,10 @@ fn a_topic_is_forwarded_from_udp_to_a_broker_and_reloaded_routes_end_it() {
     let both: [(u64, Value); 2] = carriers(METRICS_SERVER).try_into().unwrap();
     let [(to_udp, _), (to_broker, _)] = both;
     assert!(to_broker > 0, "{to_udp} {to_broker}");
+    // Values from UDP are JSON at the broker, as its encoding says.
+    let mut seen = cell.mosquitto_sub(&["-t", "opcua/json/data/#"]);
+    let topic = seen.wait_for_json("a value as JSON", SOON, |line| line.get("topic").cloned());
+    assert_eq!(topic, "opcua/json/data/1/5/10");
     // Nothing goes round in a circle: each value is delivered once.
     let status = metrics(METRICS_ROS2).unwrap();
     let topic = &status["topics"]["ua_1_5_10"];
