@@ -170,6 +170,9 @@ pub struct Execution<R = Vec<u8>> {
     pub requestor: Option<SpaceId>,
     /// The time at which the requestor stops waiting.
     pub deadline: Instant,
+    /// The time until which the execution may be started: a later start is a start by a program
+    /// that was stopped, while a redundant bridge has taken over.
+    pub start_by: Instant,
 }
 
 /// The outcome of an execution.

@@ -28,6 +28,7 @@ use crate::description::{
     version_time, with_structures,
 };
 use crate::learned::Weight;
+use crate::redundancy::Rank as BridgeRank;
 
 /// The ROS messages of the fields of a call.
 #[derive(Clone, Copy)]
@@ -93,13 +94,15 @@ impl CallAnnouncement {
         })
     }
 
-    /// Writes the announcement into an empty buffer and returns the offset of its body.
-    pub(crate) fn write(&self, sequence_number: u16, out: &mut Vec<u8>) -> usize {
+    /// Writes the announcement with the ActionTargetId into an empty buffer and returns the offset
+    /// of its body.
+    pub(crate) fn write(&self, (sequence_number, target): (u16, u16), out: &mut Vec<u8>) -> usize {
         out.extend_from_slice(&self.datagram);
-        // The SequenceNumber follows the AnnouncementType.
-        let at = self.body_at + 1;
-        if let Some(place) = out.get_mut(at..at + 2) {
-            place.copy_from_slice(&sequence_number.to_le_bytes());
+        for (offset, number) in [(SEQUENCE_NUMBER_AT, sequence_number), (TARGET_AT, target)] {
+            let at = self.body_at + offset;
+            if let Some(bytes) = out.get_mut(at..at + 2) {
+                bytes.copy_from_slice(&number.to_le_bytes());
+            }
         }
         self.body_at
     }
@@ -355,6 +358,16 @@ pub(crate) fn target_of(instance: [u8; 16]) -> u16 {
     folded.max(LASTING_TARGET)
 }
 
+/// Returns the ActionTargetId of all calls of a redundant bridge. Two terms of a bridge as the
+/// active one have different ActionTargetIds, and so have bridges of different ranks: a request to
+/// a former active bridge is never executed by another.
+pub(crate) fn target_of_term(instance: [u8; 16], rank: BridgeRank, term: u64) -> u16 {
+    let first = u64::from(target_of(instance));
+    // Two bits are left for the rank. 0 is left out, so that no result is `LASTING_TARGET`.
+    let term = first.wrapping_add(term) % MOST_TERMS + 1;
+    u16::try_from(term << 2).unwrap_or(u16::MAX) | u16::from(rank.get())
+}
+
 /// Reads the role of the call in an action from the first field. Properties with invalid values are
 /// ignored.
 fn read_role(request: &DataSetMetaDataType<'_>) -> CallRole {
@@ -557,6 +570,13 @@ fn weight(field: &CallField, seen: &mut Vec<*const CallStructure>) -> usize {
 /// The ActionTargetId that is valid for each call in every instance of its program. It is for
 /// requestors with static configuration that do not receive announcements.
 pub(crate) const LASTING_TARGET: u16 = 1;
+/// The offsets of the SequenceNumber and of the ActionTargetId in the body: behind the
+/// AnnouncementType, and behind the DataSetWriterId and the number of targets (OPC 10000-14,
+/// 7.2.4.6.11).
+const SEQUENCE_NUMBER_AT: usize = 1;
+const TARGET_AT: usize = 9;
+/// The number of terms of a bridge with different ActionTargetIds.
+const MOST_TERMS: u64 = (1 << 14) - 1;
 /// The Property of optional request fields: the fields may be omitted if all are omitted.
 const OPTIONAL: QualifiedName<'static> = QualifiedName {
     namespace: 0,
@@ -619,7 +639,7 @@ mod tests {
         )
         .unwrap();
         let mut bytes = Vec::new();
-        announcement.write(3, &mut bytes);
+        announcement.write((3, 9), &mut bytes);
         let message = NetworkMessage::decode(&bytes).unwrap();
         let announced = Announcement::decode(&message).unwrap();
         assert_eq!(announced.sequence_number, 3);
@@ -699,7 +719,7 @@ mod tests {
         let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
         let announcement = CallAnnouncement::new(topic, said, None, utc).unwrap();
         let mut bytes = Vec::new();
-        announcement.write(3, &mut bytes);
+        announcement.write((3, 9), &mut bytes);
         let message = NetworkMessage::decode(&bytes).unwrap();
         let Announced::ActionMetaData(action) = Announcement::decode(&message).unwrap().announced
         else {

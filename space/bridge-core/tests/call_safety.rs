@@ -57,7 +57,16 @@ fn large(bytes: u32) -> Vec<u8> {
 
 /// Returns a datagram with a request for the call as sent by a program of another vendor.
 fn request(response_address: Option<&str>, request_id: u16) -> Vec<u8> {
-    let (space, namespace, writer_id) = start().triple();
+    request_to(start(), response_address, request_id)
+}
+
+/// Returns a request for a call without a ResponseAddress.
+pub(crate) fn request_for(topic: TopicId, request_id: u16) -> Vec<u8> {
+    request_to(topic, None, request_id)
+}
+
+fn request_to(topic: TopicId, response_address: Option<&str>, request_id: u16) -> Vec<u8> {
+    let (space, namespace, writer_id) = topic.triple();
     let address = ActionAddress {
         publisher_id: OwnedPublisherId::UInt16(space),
         writer_group_id: Some(namespace),

@@ -32,6 +32,7 @@ mod loop_freedom;
 mod metadata;
 mod publish;
 mod redundancy;
+mod redundant_calls;
 mod reload;
 mod router;
 mod secured;

@@ -8,7 +8,7 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_core::{CallRole, Executed, ExecutionId, OfferedType, Refusal};
 use bytes::Bytes;
@@ -18,6 +18,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
 use uadp::StatusCode;
 
+use crate::clock::now;
 use crate::policy::Policy;
 use crate::port::Execution;
 use crate::present::{self, Present};
@@ -208,6 +209,7 @@ impl<C: ServiceCall + Sync> Executing<C> {
     pub fn execute(&mut self, execution: Execution) -> Result<(), Refusal> {
         let served = self.served.get(&execution.topic);
         let served = served.ok_or(Refusal::NotExecutable)?;
+        let start_by = execution.start_by;
         let place = Arc::clone(&served.places).try_acquire_owned();
         let place = place.map_err(|_| Refusal::Busy)?;
         let report = self.report.clone().try_reserve_owned();
@@ -218,7 +220,7 @@ impl<C: ServiceCall + Sync> Executing<C> {
         } = execution;
         self.running.insert(id, topic);
         self.tasks
-            .spawn(run(client, (id, request), (report, place)));
+            .spawn(run(client, (id, request, start_by), (report, place)));
         Ok(())
     }
 
@@ -262,10 +264,17 @@ impl<C: ServiceCall + Sync> Executing<C> {
 /// client.
 async fn run<C: ServiceCall + Sync>(
     client: Arc<C>,
-    (execution, request): (ExecutionId, Bytes),
+    (execution, request, start_by): (ExecutionId, Bytes, Instant),
     (report, place): (mpsc::OwnedPermit<Done>, OwnedSemaphorePermit),
 ) {
-    let result = client.call(request).await;
+    let result = match now().monotonic <= start_by {
+        true => client.call(request).await,
+        false => Err(CallFault {
+            text: TOO_LATE.to_owned(),
+            may_pass: true,
+            ran: Ran::No,
+        }),
+    };
     drop(place);
     drop(report.send(Done { execution, result }));
 }
@@ -295,6 +304,9 @@ const MOST_SERVED: usize = 1024;
 const MOST_AT_A_TIME: usize = 256;
 /// The maximal number of concurrent executions of all services.
 const MOST_RUNNING: usize = 1024;
+/// The reason for which an execution is not started.
+pub(crate) const TOO_LATE: &str = "not started: the request waited in this program for too long, and another bridge \
+                                   may have taken over";
 /// Time limit of a call, unless the mapping sets it.
 const TIMEOUT: Duration = Duration::from_secs(30);
 /// Bad_UnexpectedError (OPC 10000-6, A.2): the service ran and reports a failure.

@@ -74,17 +74,8 @@ pub(crate) fn check(flags: &Flags, mapping: &Mapping, spaces: &[SpaceId]) -> Res
 }
 
 /// Returns the first entry of the mapping that a redundant bridge of the space does not carry, as
-/// text for the user.
+/// text for the user: a value that calls a service or is made of its responses.
 pub(crate) fn uncovered(mapping: &Mapping, own: SpaceId) -> Option<String> {
-    let executed = mapping.executed_in(own).next();
-    let call = executed.or_else(|| mapping.asked_in(own).map(|(call, _)| call).next());
-    if let Some(call) = call {
-        return Some(format!(
-            "calls and actions are not carried by redundant bridges, and call `{}` concerns space {own}; give it to \
-             a bridge without --rank, or leave --rank out",
-            call.name
-        ));
-    }
     let mut values = mapping.variables().iter();
     let value = values.find(|variable| {
         let service = variable.service.as_ref();
@@ -92,7 +83,7 @@ pub(crate) fn uncovered(mapping: &Mapping, own: SpaceId) -> Option<String> {
     });
     value.map(|value| {
         format!(
-            "services are not carried by redundant bridges, and variable `{}` has a service in space {own}; give it \
+            "values of services are not carried by redundant bridges, and variable `{}` has a service in space {own}; give it \
              to a bridge without --rank, or leave --rank out",
             value.name
         )
@@ -124,6 +115,9 @@ variables:
 calls:
   - {node: ns=5;i=60, name: Grip, origin: 2, ros: [{service: /g, type: std_srvs/Trigger}, {space: 1, service: /g, type: std_srvs/Trigger}]}
 ";
+    const SERVICE: &str = "
+  - {node: ns=5;i=11, name: Light, origin: 1, ros: [{topic: /l, type: std_msgs/Bool}, {space: 2, service: /l, type: std_srvs/SetBool, request: {field: data}}]}
+";
 
     fn checked(words: &[&str], yaml: &str) -> Result<(), String> {
         let all = std::iter::once(&"bridge").chain(words);
@@ -138,6 +132,7 @@ calls:
     fn a_redundant_bridge_refuses_what_it_does_not_carry() {
         let rank = ["--rank", "2"];
         assert_eq!(checked(&rank, VALUES), Ok(()));
+        assert_eq!(checked(&rank, &format!("{VALUES}{CALLS}")), Ok(()));
         let refused = |words: &[&str], yaml: &str, said: &str| {
             let words: Vec<&str> = rank.iter().chain(words).copied().collect();
             let why = checked(&words, yaml).unwrap_err();
@@ -154,7 +149,7 @@ calls:
             VALUES,
             "multicast",
         );
-        refused(&[], &format!("{VALUES}{CALLS}"), "call `Grip`");
+        refused(&[], &format!("{VALUES}{SERVICE}"), "variable `Light`");
     }
 
     #[test]

@@ -15,7 +15,7 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, Notice, Output, Owned, Reason, Router};
+use bridge_core::{Handover, Heard, Notice, Output, Owned, Reason, Router};
 use bytes::Bytes;
 use mappings::{Mapping, PubSub, SpaceId, TopicId};
 use tokio::sync::watch;
@@ -538,7 +538,7 @@ impl<P: Port> Shell<P> {
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
                 Output::Settled { topic, arrival } => self.port.settled(topic, &arrival),
                 Output::HandoverWanted { topic, instance } => {
-                    self.handed(topic, Some(instance));
+                    let _reported = self.handed(topic, Some(instance));
                 }
                 Output::CommanderLost { topic } => {
                     let name = self.name_of(topic);
@@ -644,24 +644,29 @@ impl<P: Port> Shell<P> {
         match self.port.publish(sample) {
             Ok(()) => {
                 self.router.published(topic, arrived, now());
-                self.handed(topic, instance);
+                if self.handed(topic, instance) == Some(Handover::Nobody) {
+                    let cause = (Reason::NoSubscriber, NO_SUBSCRIBER);
+                    self.router.lost(Some(topic), 1, cause);
+                }
             }
             Err(NO_SUBSCRIBER) => {
                 self.router.published(topic, arrived, now());
                 let cause = (Reason::NoSubscriber, NO_SUBSCRIBER);
                 self.router.lost(Some(topic), 1, cause);
-                self.handed(topic, instance);
+                let _reported = self.handed(topic, instance);
             }
             Err(why) => self.router.not_published(topic, instance, why),
         }
     }
 
-    /// Reports the handover of a delivery, if it is to be confirmed.
-    fn handed(&mut self, topic: TopicId, instance: Option<Timestamp>) {
-        if self.router.is_to_confirm(topic, instance) {
-            let handover = self.port.handover(topic);
-            self.router.handed(topic, instance, handover);
+    /// Reports the handover of a delivery, if it is to be confirmed, and returns it.
+    fn handed(&mut self, topic: TopicId, instance: Option<Timestamp>) -> Option<Handover> {
+        if !self.router.is_to_confirm(topic, instance) {
+            return None;
         }
+        let handover = self.port.handover(topic);
+        self.router.handed(topic, instance, handover);
+        Some(handover)
     }
 }
 

@@ -111,12 +111,14 @@ impl Bench {
     }
 
     fn execute(&mut self, topic: TopicId, id: u64) -> Result<(), Refusal> {
+        let deadline = now().monotonic + Duration::from_secs(1);
         self.executing.execute(Execution {
             id: ExecutionId::new(id),
             topic,
             request: Bytes::new(),
             requestor: None,
-            deadline: now().monotonic + Duration::from_secs(1),
+            deadline,
+            start_by: deadline,
         })
     }
 }

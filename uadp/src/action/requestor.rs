@@ -353,6 +353,16 @@ impl Requestor {
         }
     }
 
+    /// Returns whether the Responder has reported that it executes the call. Its request is not
+    /// sent again then.
+    #[must_use]
+    pub fn is_received(&self, call: CallId) -> bool {
+        let call = self.calls.get(&call.0);
+        call.is_some_and(|call| {
+            matches!(call.phase, Phase::Asking { .. }) && call.sent && call.next_send.is_none()
+        })
+    }
+
     /// Handles a response from any Responder.
     ///
     /// # Errors

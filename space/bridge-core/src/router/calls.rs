@@ -7,6 +7,7 @@
 mod chunks;
 mod execute;
 mod learn;
+mod takeover;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -29,7 +30,7 @@ use self::execute::{Own, Running};
 use self::learn::{Group, Known};
 use super::{About, Router};
 use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap};
-use crate::call_announcement::{LASTING_TARGET, target_of};
+use crate::call_announcement::LASTING_TARGET;
 use crate::call_plan::CallPlan;
 use crate::counters::{Cause, Reason};
 use crate::fields;
@@ -102,7 +103,12 @@ struct Asked {
 }
 
 impl Calls {
-    fn new(own: SpaceId, instance: [u8; 16], receive_timeout: Duration, start: Instant) -> Self {
+    fn new(
+        (own, instance): (SpaceId, [u8; 16]),
+        target: u16,
+        receive_timeout: Duration,
+        start: Instant,
+    ) -> Self {
         let settings = RequestorSettings {
             receive_timeout,
             max_bytes: 4 * MAX_BLOCK,
@@ -120,7 +126,7 @@ impl Calls {
                 max_bytes_per_sender: 2 * MAX_BLOCK,
                 ..ResponderSettings::default()
             }),
-            target: target_of(instance),
+            target,
             table: HashMap::new(),
             groups: HashMap::new(),
             weight: 0,
@@ -181,8 +187,10 @@ impl Router {
     fn calls_mut(&mut self, now: Now) -> &mut Calls {
         let (own, instance) = (self.values.settings.own, self.instance);
         let timeout = self.values.mapping.pubsub().receive_timeout;
-        self.calls
-            .get_or_insert_with(|| Box::new(Calls::new(own, instance, timeout, now.monotonic)))
+        let target = self.target();
+        self.calls.get_or_insert_with(|| {
+            Box::new(Calls::new((own, instance), target, timeout, now.monotonic))
+        })
     }
 
     /// Returns the counters of each call that is known, requested or executed, in no particular
@@ -282,7 +290,10 @@ impl Router {
         timeout: Duration,
         now: Now,
     ) {
-        let begun = self.begin(topic, request, timeout, now);
+        let begun = match self.is_muted_now(now) {
+            true => Err(takeover::not_asked()),
+            false => self.begin(topic, request, timeout, now),
+        };
         let calls = self.calls_mut(now);
         let call = calls.table.entry(topic).or_default();
         call.counters.asked += 1;
@@ -294,7 +305,10 @@ impl Router {
                 calls.reckon();
             }
             Err((cause, error)) => {
-                call.counters.refused += 1;
+                match error.kind {
+                    AskErrorKind::Unknown => call.counters.unknown += 1,
+                    AskErrorKind::Refused | AskErrorKind::Failed => call.counters.refused += 1,
+                }
                 let detail = error.text.clone();
                 calls.news.push_back(Output::Answer {
                     ask,
@@ -474,9 +488,13 @@ impl Router {
         now: Now,
     ) {
         if !self.values.may_cross(Side::Ua, What::Response, topic) {
+            if self.is_redundant_peer(from) {
+                return;
+            }
             let (_, namespace, _) = topic.triple();
             return self.values.drop_own(Some(namespace), from, now);
         }
+        let is_successor = self.is_active_sender(topic.space, from);
         let Some(calls) = &mut self.calls else {
             return self
                 .values
@@ -484,7 +502,7 @@ impl Router {
         };
         let since = calls.since_start(now);
         let known = calls.table.get(&topic).and_then(|call| call.known.as_ref());
-        let impostor = known.is_some_and(|known| known.from != from);
+        let impostor = known.is_some_and(|known| known.from != from) && !is_successor;
         let heard = match impostor {
             true => Err(ResponseDrop::Elsewhere),
             false => calls.requestor.handle_response(response, since),

@@ -82,8 +82,12 @@ impl Router {
         if self.values.is_ours(space, namespace) {
             // A large request for an own call has the PublisherId of the own space, as a small
             // request has.
-            let request = message.is_chunk() && !message.is_sealed() && self.calls.is_some();
-            match (request && message.writer_ids().is_none(), namespace) {
+            let is_request = message.is_chunk()
+                && !message.is_sealed()
+                && self.calls.is_some()
+                && message.writer_ids().is_none();
+            let is_muted = self.values.is_muted();
+            match (is_request && !is_muted, namespace) {
                 (true, Some(namespace)) if self.may_request(namespace, from) => {
                     self.handle_chunk(message, (space, namespace), from, now);
                 }
@@ -97,6 +101,10 @@ impl Router {
                     });
                 }
                 _ if self.follow_peer(message, namespace, from, now) => {}
+                _ if is_request && is_muted => {
+                    let cause = (Reason::Takeover, "standby");
+                    self.values.count(About::sender(from), cause, 1, String::new);
+                }
                 _ => self.values.drop_own(namespace, from, now),
             }
             return;

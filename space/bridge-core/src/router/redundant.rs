@@ -104,6 +104,13 @@ impl Router {
             .map(|redundant| &redundant.state)
     }
 
+    /// Returns whether another redundant bridge of the space publishes on the local side, or may
+    /// do so.
+    #[must_use]
+    pub fn is_standby(&self) -> bool {
+        self.values.is_muted_locally()
+    }
+
     /// Returns the number of samples that were muted.
     #[must_use]
     pub fn muted_samples(&self) -> Option<MutedSamples> {
@@ -587,6 +594,7 @@ impl Router {
             redundant.unsure.clear();
             redundant.took_over = None;
         }
+        self.end_term(now);
         for at in self.values.topics.handles() {
             self.values.mute_topic(at.topic(), now);
             self.values.withdraw_states(at);
@@ -693,6 +701,7 @@ impl Router {
         }
         // Its confirmations count after its announcement.
         self.announcements.plan_application(now);
+        self.begin_term(now);
     }
 
     /// Continues the sequence numbers of an own topic, and repeats its state.

@@ -12,8 +12,8 @@ use bridge_core::{
 };
 use mappings::{Mapping, SpaceId, TopicId};
 use uadp::{
-    DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, Scalar, Timestamp,
-    Variant,
+    DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
+    NetworkMessageType, Scalar, Timestamp, Variant,
 };
 
 /// Returns the number of copies of a datagram that are delivered; 1 by default.
@@ -45,6 +45,9 @@ pub(crate) struct Program {
     outputs: Vec<Output>,
     sent: Vec<Vec<u8>>,
     dead: bool,
+    /// Stopped as by SIGSTOP: its datagrams wait in its socket.
+    stopped: bool,
+    socket: Vec<(SocketAddr, Vec<u8>)>,
 }
 
 impl Program {
@@ -67,7 +70,15 @@ impl Program {
             outputs: Vec::new(),
             sent: Vec::new(),
             dead: false,
+            stopped: false,
+            socket: Vec::new(),
         }
+    }
+
+    /// Replaces the mapping.
+    pub(crate) fn mapped(mut self, mapping: &Arc<Mapping>) -> Self {
+        self.router.replace_mapping(Arc::clone(mapping), start());
+        self
     }
 
     /// Changes the port, as for another program or for a restarted program.
@@ -76,6 +87,10 @@ impl Program {
         self.router.set_source(self.address);
         self.router.set_instance(instance(self.address));
         self
+    }
+
+    fn runs(&self) -> bool {
+        !self.dead && !self.stopped
     }
 
     pub(crate) fn owning(mut self, namespaces: &[u16]) -> Self {
@@ -130,7 +145,7 @@ impl Cell {
         let end = self.passed + time;
         for _ in 0..200_000 {
             self.carry();
-            let due = self.programs.iter().filter(|program| !program.dead);
+            let due = self.programs.iter().filter(|program| program.runs());
             let due = due
                 .filter_map(|program| program.router.poll_timeout())
                 .min();
@@ -146,7 +161,7 @@ impl Cell {
             }
             for at in 0..self.programs.len() {
                 let now = self.now();
-                if !self.programs[at].dead {
+                if self.programs[at].runs() {
                     self.programs[at].router.handle_timeout(now);
                     self.drain(at);
                 }
@@ -184,7 +199,9 @@ impl Cell {
     pub(crate) fn hear(&mut self, at: usize, bytes: &[u8], from: SocketAddr) {
         let now = self.now();
         let program = &mut self.programs[at];
-        if !program.dead {
+        if program.stopped {
+            program.socket.push((from, bytes.to_vec()));
+        } else if !program.dead {
             program.router.handle_datagram(bytes, from, now);
             self.drain(at);
         }
@@ -193,7 +210,7 @@ impl Cell {
     pub(crate) fn drain(&mut self, at: usize) {
         let now = self.now();
         let program = &mut self.programs[at];
-        if program.dead {
+        if !program.runs() {
             return;
         }
         while let Some(output) = program.router.poll_output(now) {
@@ -202,6 +219,9 @@ impl Cell {
                 | Output::Discovery { bytes }
                 | Output::Heartbeat { bytes }
                 | Output::Action { bytes, .. } => {
+                    if program.router.redundancy().is_some() && is_heartbeat(&bytes) {
+                        program.router.heartbeat_sent(true, now);
+                    }
                     for _ in 0..(self.copies)(&bytes) {
                         let delay = (self.delay)();
                         let datagram = (program.address, bytes.clone());
@@ -221,6 +241,19 @@ impl Cell {
 
     pub(crate) fn kill(&mut self, at: usize) {
         self.programs[at].dead = true;
+    }
+
+    /// Stops a program as SIGSTOP does.
+    pub(crate) fn stop(&mut self, at: usize) {
+        self.programs[at].stopped = true;
+    }
+
+    /// Continues a stopped program, which then reads its socket.
+    pub(crate) fn resume(&mut self, at: usize) {
+        self.programs[at].stopped = false;
+        for (from, bytes) in std::mem::take(&mut self.programs[at].socket) {
+            self.hear(at, &bytes, from);
+        }
     }
 
     pub(crate) fn start(&mut self, at: usize, program: Program) {
@@ -361,6 +394,15 @@ impl Cell {
 
 pub(crate) fn is_action(bytes: &[u8]) -> bool {
     NetworkMessage::decode(bytes).is_ok_and(|message| message.is_action())
+}
+
+/// Returns whether a datagram is a heartbeat of a redundant bridge, in clear or sealed.
+fn is_heartbeat(bytes: &[u8]) -> bool {
+    NetworkMessage::decode(bytes).is_ok_and(|message| {
+        message.group().is_none()
+            && message.message_type() == NetworkMessageType::DataSet
+            && !message.is_action()
+    })
 }
 
 /// Returns a block of fields.

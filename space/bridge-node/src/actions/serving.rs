@@ -23,6 +23,7 @@ use super::table::{Asked, GivenUp, Goals, Progress, Wanted};
 use super::wire::CancelRequest;
 use crate::PortEvent;
 use crate::clock::now;
+use crate::executing::TOO_LATE;
 use crate::port::Execution;
 use crate::services::{CallFault, Ran};
 
@@ -151,6 +152,10 @@ impl<C: ActionClient> Serving<C> {
     }
 
     async fn execute(&mut self, part: Part, execution: Execution) -> Result<(), Over> {
+        if part == Part::Goal && now().monotonic > execution.start_by {
+            debug!(action = %self.action.topic, "{TOO_LATE}");
+            return self.refuse(execution.id, Refusal::NotExecutable).await;
+        }
         match part {
             Part::Goal => self.ask_goal(execution).await,
             Part::Cancel => self.cancel(execution).await,

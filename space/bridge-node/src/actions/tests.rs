@@ -434,6 +434,7 @@ impl Space {
             request,
             requestor: None,
             deadline,
+            start_by: deadline,
         };
         if let Err(refusal) = self.executing.execute(execution) {
             let outcome = Executed::Refused(refusal);

@@ -3,9 +3,7 @@
 
 use std::sync::Arc;
 
-use bridge_core::{
-    AskError, AskErrorKind, CallDescription, CallMap, Executed, OfferedType, Refusal,
-};
+use bridge_core::{CallDescription, CallMap, Executed, OfferedType, Refusal};
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::ServiceType;
@@ -24,9 +22,6 @@ impl<P: Port> Shell<P> {
         reason = "the caller handles all other outputs"
     )]
     pub(super) fn call_event(&mut self, event: PortEvent) {
-        if self.router.redundancy().is_some() {
-            return self.refuse_call_event(event);
-        }
         match event {
             PortEvent::Described { topic, description } => {
                 self.router.describe_value(topic, description, now());
@@ -60,33 +55,6 @@ impl<P: Port> Shell<P> {
             PortEvent::Withdrawn { topic } => self.router.withdraw(topic, now()),
             PortEvent::Executed { execution, outcome } => {
                 self.router.executed(execution, outcome, now());
-            }
-            _ => {}
-        }
-    }
-
-    /// Refuses the events of the port that concern calls: redundant bridges do not carry calls,
-    /// because a request in flight at a takeover could be executed twice.
-    #[expect(
-        clippy::wildcard_enum_match_arm,
-        reason = "all others concern calls and have no response"
-    )]
-    fn refuse_call_event(&mut self, event: PortEvent) {
-        match event {
-            PortEvent::Described { topic, description } => {
-                self.router.describe_value(topic, description, now());
-            }
-            PortEvent::Withdrawn { topic } => self.router.withdraw(topic, now()),
-            PortEvent::Ask { ask, topic, .. } => {
-                let error = AskError {
-                    kind: AskErrorKind::Refused,
-                    status: Refusal::NotExecutable.status_code(),
-                    text: NO_CALLS.to_owned(),
-                };
-                self.port.answered(ask, topic, Err(error));
-            }
-            PortEvent::Offer { topic, .. } | PortEvent::OfferTyped { topic, .. } => {
-                warn!(%topic, "not executed for the space: {NO_CALLS}");
             }
             _ => {}
         }
@@ -132,13 +100,32 @@ impl<P: Port> Shell<P> {
 
     /// Passes a call of another program to the port.
     pub(super) fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
-        if self.router.redundancy().is_some() {
-            debug!(%topic, "a call is not offered on the local side: {NO_CALLS}");
-            return;
-        }
         debug!(%topic, name = description.name, "another program offers a call");
         self.observe(|observer| observer.call_known(topic, description));
+        if self.router.is_standby() {
+            // The active bridge offers it: two servers of one name would both get each request.
+            return;
+        }
         self.port.call_known(topic, description);
+    }
+
+    /// Offers the calls of other programs on the local side, or withdraws them, after a change of
+    /// the role.
+    pub(super) fn offer_calls_of_others(&mut self, offers: bool) {
+        let known: Vec<(TopicId, Arc<CallDescription>)> = self
+            .router
+            .calls()
+            .filter_map(|(topic, _)| {
+                let description = self.router.described_call(topic)?;
+                Some((topic, Arc::clone(description)))
+            })
+            .collect();
+        for (topic, description) in known {
+            match offers {
+                true => self.port.call_known(topic, &description),
+                false => self.port.call_gone(topic),
+            }
+        }
     }
 
     /// Removes a call of another program from the port.
@@ -156,6 +143,7 @@ impl<P: Port> Shell<P> {
             request,
             requestor,
             deadline,
+            start_by,
         } = execution;
         let execution = Execution {
             id,
@@ -163,6 +151,7 @@ impl<P: Port> Shell<P> {
             request: Bytes::from(request),
             requestor,
             deadline,
+            start_by,
         };
         if self.dry_run || !self.port.execute(execution) {
             let refused = Executed::Refused(Refusal::NotExecutable);
@@ -190,7 +179,3 @@ impl<P: Port> Shell<P> {
         self.port.taken(namespace, by);
     }
 }
-
-/// The reason why a redundant bridge carries no calls, as text for the user.
-const NO_CALLS: &str =
-    "redundant bridges do not carry calls and actions; start a bridge without --rank for them";

@@ -40,11 +40,15 @@ impl<P: Port> Shell<P> {
     pub(super) fn tell_role(&mut self, change: RoleChange) {
         let rank = self.router.redundancy().map(|state| state.rank().get());
         match change {
-            RoleChange::TookOver { cause, epoch, gap } => tell_active(rank, (cause, epoch, gap)),
+            RoleChange::TookOver { cause, epoch, gap } => {
+                self.offer_calls_of_others(true);
+                tell_active(rank, (cause, epoch, gap));
+            }
             RoleChange::Follows { rank: other, from } => tell_standby(rank, (other, from)),
             RoleChange::Muted { cause } => {
                 let is_planned = matches!(cause, MuteCause::Released | MuteCause::Unfit);
                 self.port.drop_waiting(!is_planned);
+                self.offer_calls_of_others(false);
                 tell_muted(rank, cause);
             }
             RoleChange::Rival { rank: other, from } => tell_rival(rank, (other, from)),

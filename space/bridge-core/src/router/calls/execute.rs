@@ -223,8 +223,13 @@ impl Router {
         {
             return self.count_call(topic, Some(from), Reason::NotAsked, String::new);
         }
+        if self.is_muted_now(now) {
+            // Another bridge answers it.
+            return self.count_call(topic, Some(from), (Reason::Takeover, "standby"), String::new);
+        }
         let (_, namespace, _) = topic.triple();
         let origin = self.origin(namespace, from);
+        let is_redundant = self.values.redundant.is_some();
         // A sender with the keys of the group is trusted at any address.
         let known = origin.group != STRANGERS;
         let group = self.values.mapping.pubsub().address;
@@ -235,7 +240,17 @@ impl Router {
         };
         let since = calls.since_start(now);
         let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
-        let judged = may_be_executed(own, request, (from, group), known);
+        let judged = match is_redundant && request.target_id == LASTING_TARGET {
+            true => Err((
+                Refusal::NotExecutable,
+                "no ActionTargetId",
+                format!(
+                    "{from} sent a request with the ActionTargetId {LASTING_TARGET}, and redundant bridges execute \
+                     only requests with their announced ActionTargetId"
+                ),
+            )),
+            false => may_be_executed(own, request, (from, group), known),
+        };
         let verdict = judged.as_ref().map(|_| ()).map_err(|refused| refused.0);
         let requested = calls
             .responder
@@ -248,9 +263,11 @@ impl Router {
                 // The requestor receives the outcome when it repeats the request.
                 let _told = calls.responder.finish(id, lost, since).is_ok();
                 let cause = (Reason::CallRefused, "earlier life");
-                self.count_call(topic, Some(from), cause, || {
-                    "not executed: the request was sent before this program was restarted"
-                        .to_owned()
+                self.count_call(topic, Some(from), cause, || match is_redundant {
+                    true => "not executed: the request was sent to the bridge that was active before"
+                        .to_owned(),
+                    false => "not executed: the request was sent before this program was restarted"
+                        .to_owned(),
                 });
             }
             Ok(Requested::Execute(id)) => {
@@ -360,6 +377,10 @@ impl Router {
         };
         let hint = request.action.timeout().unwrap_or(TIMEOUT);
         let deadline = now.monotonic + hint.min(MAX_TIMEOUT);
+        let start_by = match self.values.redundant {
+            Some(_) => deadline.min(now.monotonic + START_WITHIN),
+            None => deadline,
+        };
         let running = Running {
             topic,
             deadline,
@@ -376,6 +397,7 @@ impl Router {
             request: block,
             requestor: u16::try_from(number).ok().and_then(SpaceId::new),
             deadline,
+            start_by,
         }));
     }
 
@@ -455,7 +477,7 @@ impl super::Calls {
             return;
         };
         let mut bytes = values.buffer();
-        let body_at = announcement.write(sequence, &mut bytes);
+        let body_at = announcement.write((sequence, self.target), &mut bytes);
         values.send_announcement(topic, sequence, (bytes, body_at), now);
     }
 
@@ -528,5 +550,8 @@ const BAD_ENCODING_ERROR: StatusCode = StatusCode(0x8006_0000);
 /// The default and the maximum timeout, as in a Responder.
 const TIMEOUT: Duration = Duration::from_secs(60);
 const MAX_TIMEOUT: Duration = Duration::from_secs(3600);
+/// The time within which the local side starts an execution of a redundant bridge: less than the
+/// time of a takeover.
+const START_WITHIN: Duration = Duration::from_millis(50);
 /// The time after its deadline at which an execution is removed.
 const FORGOTTEN: Duration = Duration::from_secs(60);

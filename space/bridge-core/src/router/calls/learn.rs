@@ -201,6 +201,8 @@ impl Router {
     /// Returns whether the sender may be the executor of the calls of the namespace.
     fn may_execute(&mut self, of: (SpaceId, u16), from: SocketAddr, now: Now) -> bool {
         let silences = self.silences();
+        // The keys of the group show that a redundant bridge has taken over.
+        let is_successor = self.is_active_sender(of.0, from);
         let Some(group) = self
             .calls
             .as_mut()
@@ -208,7 +210,8 @@ impl Router {
         else {
             return true;
         };
-        let may = group.from == from || group.is_silent(now.monotonic, silences);
+        let may =
+            group.from == from || is_successor || group.is_silent(now.monotonic, silences);
         if !may {
             group.doubted.get_or_insert(now.monotonic);
         }
