@@ -174,6 +174,9 @@ document! {
         endpoint: String,
         /// ApplicationUri; default urn:ua-bridge:server.
         application_uri: String,
+        /// ApplicationUris of two or three redundant servers, by their `--rank`, instead of
+        /// `application_uri`.
+        redundant: Vec<At<String>>,
         /// Security policies that the server offers. Default: all, and `None` only if the endpoint
         /// is a loopback address.
         security: Vec<At<SecurityEntry>>,

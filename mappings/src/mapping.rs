@@ -242,6 +242,17 @@ impl Mapping {
         &self.server
     }
 
+    /// Returns the mapping for the redundant server of a rank, which counts from 1: its
+    /// ApplicationUri is that of the rank. Returns `None` if the mapping has no such server.
+    #[must_use]
+    pub fn for_rank(&self, rank: u8) -> Option<Self> {
+        let at = usize::from(rank).checked_sub(1)?;
+        let uri = self.server.redundant.get(at)?.clone();
+        let mut mapping = self.clone();
+        mapping.server.application_uri = uri;
+        Some(mapping)
+    }
+
     pub(crate) fn with_servers(mut self, servers: Vec<RemoteServer>) -> Self {
         self.servers = servers;
         self
@@ -458,6 +469,9 @@ pub struct Server {
     pub endpoint: Endpoint,
     /// ApplicationUri of the server.
     pub application_uri: String,
+    /// ApplicationUris of redundant servers by their rank, which counts from 1; empty without
+    /// redundancy.
+    pub redundant: Vec<String>,
     /// Security policies that it offers, without repetition and not empty; `None` if the document
     /// names none.
     pub security: Option<Vec<SecurityPolicy>>,
@@ -521,6 +535,7 @@ impl Default for Server {
         Self {
             endpoint: Endpoint::default(),
             application_uri: "urn:ua-bridge:server".to_owned(),
+            redundant: Vec::new(),
             security: None,
             anonymous: Anonymous::Usual,
             refuse_other_hosts: false,

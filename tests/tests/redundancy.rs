@@ -2,6 +2,7 @@
 //! No value is doubled and none comes late.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::Ipv4Addr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -10,12 +11,12 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{
-    Cell, Child, METRICS_ROS1, METRICS_ROS2, Peer, Started, UadpSocket, eventually, metrics,
-    program,
+    Cell, Child, GroupNumbers, METRICS_ROS1, METRICS_ROS2, Peer, Started, UadpSocket, eventually,
+    metrics, program,
 };
 use uadp::{
-    DataSetHeader, GroupHeader, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
-    PublisherId, Scalar, SequenceOrder, Timestamp, Variant,
+    DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar,
+    Timestamp,
 };
 
 const SOON: Duration = Duration::from_secs(60);
@@ -100,90 +101,6 @@ impl Pair {
     }
 }
 
-/// The values of a topic in the group, as a subscriber of any maker accepts them.
-struct Listener {
-    accepted: Arc<Mutex<Vec<u32>>>,
-    ends: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
-}
-
-impl Listener {
-    fn of(triple: (u16, u16, u16)) -> Self {
-        let accepted = Arc::new(Mutex::new(Vec::new()));
-        let ends = Arc::new(AtomicBool::new(false));
-        let socket = UadpSocket::join();
-        let (values, over) = (Arc::clone(&accepted), Arc::clone(&ends));
-        let thread = thread::spawn(move || {
-            let mut last = None;
-            while !over.load(Ordering::Relaxed) {
-                if let Some(datagram) = socket.receive(Duration::from_millis(100)) {
-                    let accepted = accept(&datagram, triple, &mut last);
-                    values.lock().unwrap().extend(accepted);
-                }
-            }
-        });
-        Self {
-            accepted,
-            ends,
-            thread: Some(thread),
-        }
-    }
-
-    fn values(&self) -> Vec<u32> {
-        self.accepted.lock().unwrap().clone()
-    }
-
-    fn wait_for(&self, value: u32) {
-        eventually(&format!("value {value} or a later one"), SOON, || {
-            self.values()
-                .last()
-                .is_some_and(|last| *last >= value)
-                .then_some(())
-        });
-    }
-}
-
-impl Drop for Listener {
-    fn drop(&mut self) {
-        self.ends.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            drop(thread.join());
-        }
-    }
-}
-
-/// Returns the number in a value of the topic, unless its sequence number was received before.
-fn accept(
-    datagram: &[u8],
-    (space, group, writer): (u16, u16, u16),
-    last: &mut Option<u16>,
-) -> Option<u32> {
-    let message = NetworkMessage::decode(datagram).ok()?;
-    let is_ours = message.publisher_id() == Some(PublisherId::UInt16(space))
-        && message.group().and_then(|group| group.writer_group_id) == Some(group);
-    if !is_ours {
-        return None;
-    }
-    let message = message.messages().next()?.ok()?;
-    if message.writer_id != Some(writer) || message.kind != MessageKind::KeyFrame {
-        return None;
-    }
-    let sequence = message.sequence_number()?;
-    if let Some(last) = *last {
-        match SequenceOrder::of_u16(last, sequence) {
-            SequenceOrder::Newer { .. } => {}
-            // A subscriber drops what comes late (OPC 10000-14, 7.2.3).
-            SequenceOrder::Same | SequenceOrder::Older { .. } => return None,
-            order @ SequenceOrder::Invalid => panic!("number {sequence} after {last}: {order:?}"),
-        }
-    }
-    *last = Some(sequence);
-    match message.fields().ok()?.next()?.ok()? {
-        Variant::Scalar(Scalar::String(Some(text))) => text.parse().ok(),
-        _ => None,
-    }
-}
-
 fn assert_rising(values: &[u32]) {
     for pair in values.windows(2) {
         assert!(pair[0] < pair[1], "{} after {}", pair[1], pair[0]);
@@ -192,7 +109,7 @@ fn assert_rising(values: &[u32]) {
 
 /// Stops and kills the active bridge while a publisher sends 1000 values a second.
 fn no_value_is_doubled(mut pair: Pair, triple: (u16, u16, u16), publisher: impl FnOnce() -> Child) {
-    let listener = Listener::of(triple);
+    let listener = GroupNumbers::of(triple, Ipv4Addr::LOCALHOST);
     let mut publisher = publisher();
     // The numbers are sent once the whole path is established, for both bridges.
     let metrics_of = pair.metrics;
@@ -437,23 +354,26 @@ fn commands_reach_a_rospy_subscriber_once_while_bridges_are_stopped_killed_and_s
 }
 
 #[test]
-fn a_redundant_bridge_refuses_a_mapping_with_calls() {
+fn a_redundant_bridge_takes_calls_and_refuses_values_of_services() {
     let Some(cell) = Cell::with(&[]) else {
         return;
     };
-    let text = "spaces: [{id: 1}]\nnamespaces: {2: urn:plant}\ncalls:\n  - {node: ns=2;i=60, name: Grip, \
-                origin: 1, ros: {service: /grip, type: std_srvs/Trigger}}\n";
-    let mapping = cell.file("calls.yaml", text);
-    let mut refused = Started::new("bridge-ros1", &program("bridge-ros1"))
-        .args(["--check", "--rank", "1"])
-        .args([&mapping])
-        .start();
-    assert_eq!(refused.wait_for_end(SOON).code(), Some(78));
-    let said = refused.lines().join("\n");
-    assert!(
-        said.contains("calls and actions are not carried") && said.contains("Grip"),
-        "{said}"
-    );
+    let head = "spaces: [{id: 1}]\nnamespaces: {2: urn:plant}\n";
+    let calls = "calls:\n  - {node: ns=2;i=60, name: Grip, origin: 1, ros: {service: /grip, type: \
+                 std_srvs/Trigger}}\n";
+    let values = "variables:\n  - {node: ns=2;i=61, name: Light, type: Boolean, origin: 0, ros: {space: 1, service: \
+                  /light, type: std_srvs/SetBool, request: {field: data}}}\n";
+    for (name, text, code) in [("calls", calls, 0), ("values", values, 78)] {
+        let mapping = cell.file(&format!("{name}.yaml"), &format!("{head}{text}"));
+        let mut checked = Started::new("bridge-ros1", &program("bridge-ros1"))
+            .args(["--check", "--rank", "1"])
+            .args([&mapping])
+            .start();
+        assert_eq!(checked.wait_for_end(SOON).code(), Some(code), "{name}");
+        let said = checked.lines().join("\n");
+        let is_refused = said.contains("values of services are not carried");
+        assert_eq!(is_refused, code != 0, "{said}");
+    }
 }
 
 #[test]

@@ -48,6 +48,12 @@ pub(crate) fn opcua(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result
     )
 }
 
+/// Measures the gaps of random faults of two redundant bridges.
+pub(crate) fn redundancy(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    let packages = ["bridge-ros1", "system-tests"];
+    measured(workspace, "bench-redundancy", &packages, arguments)
+}
+
 /// Measures the response times of skills, and a server with many skills.
 pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     measured(

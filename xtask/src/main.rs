@@ -48,6 +48,7 @@ cargo xtask <verb>
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
   bench work [ARGS]              count system calls, wake-ups and CPU of both bridges per message, and of idle programs (perf)
   bench opcua [ARGS]             measure ua-server beside servers of asyncua and node-opcua, and what comes from the space to clients
+  bench redundancy [FAULTS]      measure the gaps of random faults of two redundant bridges at 1 kHz, 200 unless told
   bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding)
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
   bench messages [--instructions]  measure messages on their way to fields and back, beside memcpy, a tree of values and Python
@@ -94,6 +95,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
             bench::ros2(&Workspace::find()?, &arguments)
         }
         ["bench", "opcua", rest @ ..] => bench::opcua(&Workspace::find()?, rest),
+        ["bench", "redundancy", rest @ ..] => bench::redundancy(&Workspace::find()?, rest),
         ["bench", "skills", rest @ ..] => bench::skills(&Workspace::find()?, rest),
         ["bench", "ros2", rest @ ..] => bench::ros2(&Workspace::find()?, rest),
         _ => {

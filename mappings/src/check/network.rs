@@ -286,6 +286,7 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
     let server = Server {
         endpoint: endpoint.unwrap_or(default.endpoint),
         application_uri: application_uri.unwrap_or(default.application_uri),
+        redundant: redundant(&entry.redundant, findings),
         security,
         anonymous: permissions::anonymous(entry),
         refuse_other_hosts: given(&entry.refuse_other_hosts).is_some_and(|(refuse, _)| *refuse),
@@ -301,6 +302,38 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
     };
     permissions::left_open(entry, &server, findings);
     server
+}
+
+/// Reads the ApplicationUris of redundant servers.
+fn redundant(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> Vec<String> {
+    let Some((entries, place)) = given(field) else {
+        return Vec::new();
+    };
+    let mut uris: Vec<String> = Vec::new();
+    for entry in entries {
+        let Some(text) = entry.value.as_ref() else {
+            return Vec::new();
+        };
+        if !is_uri(text) || uris.contains(text) {
+            let message = match uris.contains(text) {
+                true => format!("`{}` is the ApplicationUri of two servers", short(text)),
+                false => format!("`{}` is not an ApplicationUri", short(text)),
+            };
+            findings
+                .error(Code::ApplicationUri, entry.place, message)
+                .help("redundant: [\"urn:cell:server-1\", \"urn:cell:server-2\"]");
+            return Vec::new();
+        }
+        uris.push(text.clone());
+    }
+    if !(2..=3).contains(&uris.len()) {
+        let message = format!("{} redundant servers; 2 or 3 are possible", uris.len());
+        findings
+            .error(Code::ApplicationUri, place, message)
+            .help("redundant: [\"urn:cell:server-1\", \"urn:cell:server-2\"]");
+        return Vec::new();
+    }
+    uris
 }
 
 fn history(field: &Field<HistoryEntry>, findings: &mut Findings) -> History {

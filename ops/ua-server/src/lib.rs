@@ -55,6 +55,7 @@ mod presence;
 mod programs;
 mod properties;
 mod pubsub;
+mod redundant;
 mod sks;
 mod sources;
 mod space;
@@ -71,7 +72,7 @@ use std::sync::{Arc, OnceLock};
 
 use bridge_node::{
     Arguments, Context, Failure, FailureKind, KeyService, NodeSetReader, Observer, Owned, Program,
-    SharedProgram, Site,
+    Rank, SharedProgram, Site,
 };
 use discovery::scan::Range;
 use discovery::{AnnounceSettings, Interface};
@@ -111,6 +112,10 @@ struct UaServer {
     announce: bool,
     #[command(flatten)]
     gds: GdsArguments,
+    /// Run as one of up to three redundant servers, whose ApplicationUris are in `server.redundant`
+    /// of the mapping: all show the values, and a single one sends the values of clients and calls
+    #[arg(long, value_name = "1|2|3", env = "UA_RANK", value_parser = bridge_node::rank)]
+    rank: Option<Rank>,
     /// Show the program with this address of --metrics on the page, as http://127.0.0.1:9101. May
     /// be repeated
     #[arg(long, value_name = "URL")]
@@ -160,6 +165,18 @@ impl UaServer {
     fn sks(&self) -> Arc<Sks> {
         let made = || Arc::new(Sks::new(self.pki_root().join("private/sks.json")));
         Arc::clone(self.sks.get_or_init(made))
+    }
+
+    /// Returns the ApplicationUri of the server.
+    fn uri(&self, mapping: &Mapping) -> String {
+        let rank = self.rank.map(Rank::get);
+        let ranked = rank.and_then(|rank| mapping.for_rank(rank));
+        ranked
+            .as_ref()
+            .unwrap_or(mapping)
+            .server()
+            .application_uri
+            .clone()
     }
 
     fn page(&self) -> Arc<Page> {
@@ -232,7 +249,22 @@ impl Program for UaServer {
         Owned::Only(mapped.chain(own).chain(found).collect())
     }
 
-    fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
+    const SHOWS_VALUES_AT_STANDBY: bool = true;
+
+    fn rank(&self) -> Option<Rank> {
+        self.rank
+    }
+
+    fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
+        if let Some(rank) = self.rank.map(Rank::get)
+            && mapping.for_rank(rank).is_none()
+        {
+            let message = format!(
+                "--rank {rank}: the mapping has no ApplicationUri for it; list those of all redundant servers, as in \
+                 server: {{redundant: [urn:cell:server-1, urn:cell:server-2]}}"
+            );
+            return Err(Failure::new(FailureKind::Configuration, message));
+        }
         Ok(vec![SpaceId::UA])
     }
 
@@ -240,7 +272,7 @@ impl Program for UaServer {
         Some(Arc::new(ServerKeys {
             own: self.sks(),
             others: plant_keys::Service::new(plant_keys::Identity {
-                application_uri: mapping.server().application_uri.clone(),
+                application_uri: self.uri(mapping),
                 application_name: Self::NAME.to_owned(),
                 pki: self.pki_root(),
             }),
@@ -272,6 +304,7 @@ impl Program for UaServer {
             types: Types::new(&context.types),
             mapped_url: self.endpoint.is_none(),
             gds,
+            rank: self.rank,
             announce: self.announcement(&context.mapping),
         };
         let port = ServerPort::start(&context.mapping, setup)?;

@@ -49,6 +49,7 @@ use crate::layout::{FieldNode, Layout, TopicNode};
 use crate::nodesets::Loaded;
 use crate::properties;
 use crate::pubsub::PubSub;
+use crate::redundant::ServerRole;
 use crate::value;
 use crate::values::{self, Shown, Stamp, Values, View};
 
@@ -100,6 +101,8 @@ pub(crate) struct Exits {
     pub(crate) pubsub: Arc<PubSub>,
     /// The confirmations of writes.
     pub(crate) confirms: Arc<Confirms>,
+    /// Whether a redundant server sends the values that clients write.
+    pub(crate) role: ServerRole,
     /// The conditions of values.
     pub(crate) alarms: Arc<Alarms>,
 }
@@ -688,8 +691,9 @@ impl SpaceNodes {
         write: &ParsedWriteValue,
         (register, awaited): Registration<'_>,
     ) -> Result<(Shown, OnItsWay), StatusCode> {
-        if self.exits.pubsub.is_off(topic.topic) {
-            // The writer of the topic is disabled, so the value would not be sent.
+        if self.exits.pubsub.is_off(topic.topic) || self.exits.role.is_standby() {
+            // The writer of the topic is disabled, or another server is active, so the value would
+            // not be sent.
             return Err(StatusCode::BadInvalidState);
         }
         if write

@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 
 use bridge_node::{
     Answered, Application, Arrival, AskId, CallDescription, Delivery, Described, Execution,
-    ExecutionId, Failure, FailureKind, Kept, LinkState, Port, PortEvent, Reason, Router, TypePaths,
+    ExecutionId, Failure, FailureKind, Kept, LinkState, Port, PortEvent, Rank, Reason, Router,
+    TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
@@ -53,6 +54,7 @@ use crate::nodesets;
 use crate::operations::PageOperations;
 use crate::others::Others;
 use crate::pubsub::{Places, PubSub, Readers, State};
+use crate::redundant::{self, Condition, ServerRole, ranked};
 use crate::sks::Sks;
 use crate::sources::{self, Sourced};
 use crate::space::Space;
@@ -68,6 +70,8 @@ pub(crate) struct Setup {
     pub(crate) types: Types,
     /// True if the endpoint comes from the mapping, false if it comes from the command line.
     pub(crate) mapped_url: bool,
+    /// The rank of the server among redundant servers.
+    pub(crate) rank: Option<Rank>,
     /// Settings for announcing the server.
     pub(crate) announce: Option<AnnounceSettings>,
     /// The Global Discovery Server that renews the certificate.
@@ -109,6 +113,8 @@ pub(crate) struct ServerPort {
     /// The PubSub configuration, and the state of its readers.
     pubsub: Arc<PubSub>,
     readers: Readers,
+    rank: Option<Rank>,
+    role: ServerRole,
     /// Writes that wait for a confirmation.
     confirms: Arc<Confirms>,
     /// The conditions of values, robots and publishers.
@@ -133,6 +139,8 @@ impl ServerPort {
     /// certificate store cannot be used.
     pub(crate) fn start(mapping: &Arc<Mapping>, mut setup: Setup) -> Result<Self, Failure> {
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
+        let role = ServerRole::new(setup.rank);
+        let mapping = &ranked(mapping, setup.rank);
         let (layout, (sets, nodesets)) = laid_out(mapping, &mut setup.types)?;
         let described = mapping.server();
         setup.sks.follow(mapping)?;
@@ -141,7 +149,7 @@ impl ServerPort {
         let access = users(&setup.pki, address)?;
         access.set_rules(access::rules(mapping, &layout));
         let pubsub = Arc::new(PubSub::new());
-        let (exits, (writes, created_items, asked)) = exits(mapping, &access, &pubsub);
+        let (exits, (writes, created_items, asked)) = exits(mapping, &access, (&pubsub, &role));
         let (confirms, alarms) = (Arc::clone(&exits.confirms), Arc::clone(&exits.alarms));
         let nodes = NodesBuilder {
             layout: Arc::clone(&layout),
@@ -152,7 +160,8 @@ impl ServerPort {
         let mdns = matches!(&setup.announce, Some(to) if to.mdns.is_some());
         let shown = (&setup.sks, &pubsub, &alarms);
         let facets = facets(&security, &layout);
-        let core = core(shown, (&certificates, mdns), (described, facets), &access);
+        let described_core = (described, facets, setup.rank);
+        let core = core(shown, (&certificates, mdns), described_core, &access);
         let builder = endpoint::server(described, (&setup.url, port), &security);
         let (trusts_any, limits) = (setup.trust_any_client, endpoint::clients(described.limits));
         let built = (listener, builder);
@@ -204,6 +213,8 @@ impl ServerPort {
             events: VecDeque::new(),
             pubsub,
             readers: Readers::default(),
+            rank: setup.rank,
+            role,
             confirms,
             alarms,
             commanders: Commanders::new(mapping),
@@ -225,6 +236,20 @@ impl ServerPort {
             self.described.application_uri.as_str(),
         );
         PageOperations::new(Arc::clone(&self.access), nodes, alarms)
+    }
+
+    /// Sets the ServiceLevel, for servers with redundancy.
+    fn show_service_level(&mut self) {
+        if self.rank.is_none() {
+            return;
+        }
+        let (topics, silent) = self.readers.silence();
+        let condition = Condition {
+            is_standby: self.role.is_standby(),
+            topics,
+            silent,
+        };
+        self.handle.set_service_level(condition.service_level());
     }
 
     /// Applies changes of writers and readers that clients enabled or disabled.
@@ -325,7 +350,10 @@ impl Port for ServerPort {
             return Ok(());
         }
         if sample.status & BAD == 0 {
-            self.others.sources.put(sample.topic, &sample.payload);
+            if !self.role.is_standby() {
+                // The active server writes to other servers.
+                self.others.sources.put(sample.topic, &sample.payload);
+            }
             self.methods.reported(sample.topic, &sample.payload);
         }
         let shown = self
@@ -365,6 +393,12 @@ impl Port for ServerPort {
         self.pubsub.look(&self.readers, router);
         self.space.hear(router.heard(), self.receive_timeout);
         self.alarms.publishers(router, self.receive_timeout);
+        self.show_service_level();
+    }
+
+    fn role_changed(&mut self, is_active: bool) {
+        self.role.set_active(is_active);
+        self.show_service_level();
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
@@ -393,6 +427,7 @@ impl Port for ServerPort {
     }
 
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
+        let mapping = &ranked(mapping, self.rank);
         let (was, is) = (&self.described, mapping.server());
         let endpoint = self.mapped_url && was.endpoint != is.endpoint;
         let mut restart: Vec<String> = [
@@ -401,6 +436,7 @@ impl Port for ServerPort {
                 "server.application_uri",
                 was.application_uri != is.application_uri,
             ),
+            ("server.redundant", was.redundant != is.redundant),
             ("server.security", was.security != is.security),
             ("server.limits", was.limits != is.limits),
             ("server.history.file", was.history_file != is.history_file),
@@ -638,7 +674,7 @@ fn audit(access: &Access, handle: &ServerHandle) {
 fn core(
     (sks, pubsub, alarms): (&Arc<Sks>, &Arc<PubSub>, &Arc<Alarms>),
     (configuration, is_announced): (&Arc<Configuration>, bool),
-    (described, facets): (&Server, Facets),
+    (described, facets, rank): (&Server, Facets, Option<Rank>),
     access: &Arc<Access>,
 ) -> impl NodeManagerBuilder + use<> {
     let methods = [
@@ -652,6 +688,7 @@ fn core(
     let values = values.into_iter();
     let mut values: Vec<(VariableId, CoreValue)> =
         values.map(|(id, value)| (id, value.into())).collect();
+    values.extend(redundant::values(described, rank));
     values.extend(capabilities(&endpoint::within(described.limits), facets));
     values.extend(roles::values(access));
     let supplement = Supplement::new(values, Some(Arc::clone(access)));
@@ -761,7 +798,11 @@ fn live(layout: &Layout) -> VecDeque<(TopicId, bool)> {
 }
 
 /// Creates the channels of the node manager, with their receivers.
-fn exits(mapping: &Mapping, access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exits, Entries) {
+fn exits(
+    mapping: &Mapping,
+    access: &Arc<Access>,
+    (pubsub, role): (&Arc<PubSub>, &ServerRole),
+) -> (Exits, Entries) {
     let (writes, written) = mpsc::channel(MOST_WRITES);
     let (created, created_items) = mpsc::channel(MOST_CREATED);
     let (questions, heard) = Questions::channel();
@@ -773,6 +814,7 @@ fn exits(mapping: &Mapping, access: &Arc<Access>, pubsub: &Arc<PubSub>) -> (Exit
         access: Arc::clone(access),
         pubsub: Arc::clone(pubsub),
         confirms: Arc::default(),
+        role: role.clone(),
         alarms: Arc::default(),
     };
     exits.confirms.follow(mapping);

@@ -64,7 +64,7 @@ pub use observer::Observer;
 pub use port::{Delivery, Execution, LinkState, Port, PortEvent};
 pub use present::Present;
 pub use program::{Carried, Context, Made, Program, run};
-pub use redundancy::RedundancyArguments;
+pub use redundancy::{RedundancyArguments, rank};
 pub use restart::{restart, stop};
 pub use service::{Service, run_service};
 pub use service_manager::ready;

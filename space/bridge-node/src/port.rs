@@ -81,6 +81,12 @@ pub trait Port: Send + 'static {
         let _nothing_waits = at_once;
     }
 
+    /// Notes that this program is the active one of the redundant programs of its space, or is not
+    /// any more.
+    fn role_changed(&mut self, is_active: bool) {
+        let _alone = is_active;
+    }
+
     /// Notes that a call of another program is available or has changed.
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         let _not_served = (topic, description);

@@ -92,7 +92,11 @@ pub trait Program: Parser {
         Owned::All
     }
 
-    /// Returns the rank of the program among the redundant bridges of its spaces; `None` without
+    /// Whether the local side takes values while the program is a standby, as a server that shows
+    /// them to its clients.
+    const SHOWS_VALUES_AT_STANDBY: bool = false;
+
+    /// Returns the rank of the program among the redundant programs of its spaces; `None` without
     /// redundancy.
     fn rank(&self) -> Option<Rank> {
         None
@@ -340,6 +344,9 @@ async fn prepare<P: Program>(
     router.set_owned(P::owned(&mapping), now());
     router.set_relay(relay(carrier.as_ref()));
     identify(&mut router, program.rank())?;
+    if P::SHOWS_VALUES_AT_STANDBY {
+        router.show_values_at_standby();
+    }
     keys.start(&mapping, &mut router)?;
     router.call_the_roll(now());
     let context = Context {

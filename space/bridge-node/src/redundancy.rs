@@ -28,7 +28,11 @@ impl RedundancyArguments {
     }
 }
 
-fn rank(text: &str) -> Result<Rank, String> {
+/// Reads a rank of the command line.
+///
+/// # Errors
+/// The text is no rank.
+pub fn rank(text: &str) -> Result<Rank, String> {
     let number = text.trim().parse().ok();
     let rank = number.and_then(Rank::new);
     rank.ok_or_else(|| format!("a rank is 1 to {}", Rank::MOST))

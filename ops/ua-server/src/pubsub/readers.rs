@@ -49,6 +49,13 @@ impl Readers {
         state.unwrap_or(State::PreOperational)
     }
 
+    /// Returns the number of topics with a received value, and how many of them are silent.
+    pub(crate) fn silence(&self) -> (usize, usize) {
+        let states = self.states.values();
+        let silent = states.filter(|state| **state == State::Error).count();
+        (self.states.len(), silent)
+    }
+
     /// Returns the number of messages that were dropped because the reader was disabled.
     pub(super) fn count_ignored(&self, topic: TopicId) -> u64 {
         self.ignored.get(&topic).copied().unwrap_or_default()

@@ -99,7 +99,7 @@ pub fn capabilities(limits: &Limits, facets: Facets) -> Vec<(VariableId, CoreVal
             VariableId::Server_ServerCapabilities_MaxMonitoredItemsQueueSize,
             count(each.max_monitored_item_queue_size),
         ),
-        // RedundancySupport None: the server is not redundant.
+        // RedundancySupport None, unless a redundant server gives another value before.
         (
             VariableId::Server_ServerRedundancy_RedundancySupport,
             Variant::from(0_i32).into(),

@@ -132,6 +132,8 @@ impl Router {
             if !self.follow_peer(message, None, from, now) {
                 self.values.drop_own(None, from, now);
             }
+        } else if space == own && self.is_redundant_peer(from) {
+            // A redundant server announces what this server announces when it is active.
         } else if message.is_chunk() && !message.is_sealed() {
             self.handle_chunk(message, (space, 0), from, now);
         } else {

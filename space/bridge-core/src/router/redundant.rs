@@ -13,6 +13,7 @@ use uadp::{MessageKind, NetworkMessage, NetworkMessageType, Timestamp};
 pub(super) use self::senders::ActiveSender;
 use super::{About, Router, Values};
 use crate::counters::Reason;
+use crate::loop_rule::Owned;
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
 use crate::redundancy::{
@@ -39,6 +40,8 @@ pub(super) struct Redundant {
     took_over: Option<Succession>,
     /// The clocks of the senders in the group.
     clocks: SenderClocks,
+    /// Whether the local side takes values while this program is a standby.
+    shows_values: bool,
     /// Samples of the own space that were not sent while this bridge was muted.
     muted_sent: u64,
     /// Samples of other spaces that were not published while this bridge was muted.
@@ -90,9 +93,18 @@ impl Router {
             followed: HashMap::new(),
             took_over: None,
             clocks: SenderClocks::new(now),
+            shows_values: false,
             muted_sent: 0,
             muted_delivered: 0,
         }));
+    }
+
+    /// Lets the local side take the values of other spaces while this program is a standby, as for
+    /// a server that shows them to clients. Call it after [`set_redundancy`](Self::set_redundancy).
+    pub fn show_values_at_standby(&mut self) {
+        if let Some(redundant) = &mut self.values.redundant {
+            redundant.shows_values = true;
+        }
     }
 
     /// Returns the state of the redundancy; `None` for a program without redundancy.
@@ -242,7 +254,7 @@ impl Values {
     /// Returns whether nothing is published on the local side.
     pub(super) fn is_muted_locally(&self) -> bool {
         let redundant = self.redundant.as_ref();
-        redundant.is_some_and(|redundant| redundant.state.mutes_local())
+        redundant.is_some_and(|redundant| !redundant.shows_values && redundant.state.mutes_local())
     }
 }
 
@@ -299,7 +311,9 @@ impl Router {
             });
             return true;
         }
-        if space != self.values.settings.own {
+        // In space 0, other programs share the space with redundant servers.
+        let is_shared = self.values.redundant.is_none() && self.values.owned != Owned::All;
+        if space != self.values.settings.own || is_shared {
             self.meet_redundant(space, heartbeat, from, now);
             return true;
         }

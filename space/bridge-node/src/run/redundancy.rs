@@ -41,14 +41,18 @@ impl<P: Port> Shell<P> {
         let rank = self.router.redundancy().map(|state| state.rank().get());
         match change {
             RoleChange::TookOver { cause, epoch, gap } => {
+                self.port.role_changed(true);
                 self.offer_calls_of_others(true);
                 tell_active(rank, (cause, epoch, gap));
             }
             RoleChange::Follows { rank: other, from } => tell_standby(rank, (other, from)),
             RoleChange::Muted { cause } => {
                 let is_planned = matches!(cause, MuteCause::Released | MuteCause::Unfit);
+                self.port.role_changed(false);
                 self.port.drop_waiting(!is_planned);
-                self.offer_calls_of_others(false);
+                if self.router.is_standby() {
+                    self.offer_calls_of_others(false);
+                }
                 tell_muted(rank, cause);
             }
             RoleChange::Rival { rank: other, from } => tell_rival(rank, (other, from)),

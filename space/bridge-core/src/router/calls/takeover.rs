@@ -9,7 +9,7 @@ use std::net::SocketAddr;
 
 use mappings::TopicId;
 use uadp::StatusCode;
-use uadp::action::{CallId, Outcome, Unknown};
+use uadp::action::{CallId, Outcome, Refusal, Unknown};
 
 use super::Router;
 use crate::call::{AskError, AskErrorKind};
@@ -38,7 +38,7 @@ impl Router {
     }
 
     /// Returns whether the sender is another bridge of the own space.
-    pub(super) fn is_redundant_peer(&self, from: SocketAddr) -> bool {
+    pub(in super::super) fn is_redundant_peer(&self, from: SocketAddr) -> bool {
         self.redundancy().is_some_and(|state| state.is_peer(from))
     }
 
@@ -113,7 +113,8 @@ impl Router {
         if let Some(call) = calls.table.get_mut(&asked.topic) {
             call.counters.unknown += 1;
         }
-        let (cause, error) = not_asked();
+        // It may have been sent.
+        let (cause, error) = not_asked(false);
         calls.news.push_back(Output::Answer {
             ask: asked.ask,
             topic: asked.topic,
@@ -125,7 +126,16 @@ impl Router {
 
 /// Returns the outcome of a request that this program does not send, because another bridge of the
 /// space is active: the other bridge may have received the request of the local side too.
-pub(super) fn not_asked() -> (Cause, AskError) {
+///
+/// The clients of a server that shows values at standby are connected to a single server, so that
+/// the request is refused.
+pub(super) fn not_asked(is_server: bool) -> (Cause, AskError) {
+    if is_server {
+        let text = "this server is the standby of a redundant set; call the Method at the server with the higher \
+                    ServiceLevel";
+        let error = AskError::refused(Refusal::NotExecutable, text);
+        return ((Reason::CallRefused, "standby").into(), error);
+    }
     let error = AskError {
         kind: AskErrorKind::Unknown,
         status: BAD_NO_COMMUNICATION,
