@@ -1,5 +1,6 @@
 //! The program `bridge-ros1`, from its command line to its exit code.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -133,6 +134,10 @@ impl Program for BridgeRos1 {
 
     fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
         Ok(vec![SpaceId::ROS1])
+    }
+
+    fn part(&self) -> BTreeSet<u16> {
+        self.flags.redundancy.part()
     }
 
     fn rank(&self) -> Option<Rank> {

@@ -1,5 +1,6 @@
 //! The program `bridge-ros2`, from its command line to its exit code.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fmt::Display;
 use std::net::{IpAddr, SocketAddr};
@@ -251,6 +252,10 @@ impl Program for BridgeRos2 {
     fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
         self.chosen(mapping)
             .map_err(|message| Failure::new(FailureKind::Usage, message))
+    }
+
+    fn part(&self) -> BTreeSet<u16> {
+        self.redundancy.part()
     }
 
     fn rank(&self) -> Option<Rank> {

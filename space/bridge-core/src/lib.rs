@@ -35,6 +35,7 @@ mod loss;
 mod network;
 mod output;
 mod pace;
+mod part;
 mod place;
 mod plans;
 mod queue;

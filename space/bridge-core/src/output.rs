@@ -144,6 +144,8 @@ pub enum Output {
         namespace: u16,
         /// The address of the other sender; `None` when it has stopped.
         by: Option<SocketAddr>,
+        /// The name of the other program; empty if it is unknown.
+        name: String,
     },
     /// The keys of a secured group are out of date: a message uses an unknown key, or the next key
     /// is missing.

@@ -20,6 +20,7 @@ mod late;
 mod local;
 mod metadata;
 mod own;
+mod parts;
 mod reassembly;
 mod receive;
 mod redundant;
@@ -49,6 +50,7 @@ use crate::confirm::Handover;
 use crate::counters::{Counters, Reason, Verdict};
 use crate::hops::{Hop, Hops};
 use crate::output::{GOOD, Heard, PublisherKey};
+use crate::part::OtherParts;
 use crate::settings::{Local, Now, Settings};
 use crate::tap::{Crossing, Tapped};
 
@@ -78,9 +80,10 @@ use crate::tap::{Crossing, Tapped};
 /// - losses outside the Router: [`lost`](Self::lost), [`dropped`](Self::dropped),
 ///   [`unmatched`](Self::unmatched).
 /// - settings: [`replace_mapping`](Self::replace_mapping), [`set_owned`](Self::set_owned),
-///   [`claim`](Self::claim), [`set_source`](Self::set_source), [`set_relay`](Self::set_relay),
+///   [`claim`](Self::claim), [`set_part`](Self::set_part), [`set_source`](Self::set_source), [`set_relay`](Self::set_relay),
 ///   [`set_instance`](Self::set_instance), [`set_keys`](Self::set_keys), [`tap`](Self::tap).
-/// - redundancy: [`set_redundancy`](Self::set_redundancy), [`set_fit`](Self::set_fit),
+/// - redundancy: [`set_redundancy`](Self::set_redundancy),
+///   [`show_values_at_standby`](Self::show_values_at_standby), [`set_fit`](Self::set_fit),
 ///   [`switch_over`](Self::switch_over).
 ///
 /// # Outputs
@@ -100,7 +103,7 @@ use crate::tap::{Crossing, Tapped};
 /// - calls and programs: [`calls`](Self::calls), [`described_call`](Self::described_call),
 ///   [`applications`](Self::applications).
 /// - the Router: [`mapping`](Self::mapping), [`others`](Self::others), [`hops`](Self::hops),
-///   [`groups`](Self::groups), [`redundancy`](Self::redundancy),
+///   [`groups`](Self::groups), [`redundancy`](Self::redundancy), [`is_standby`](Self::is_standby),
 ///   [`muted_samples`](Self::muted_samples).
 #[derive(Debug)]
 pub struct Router {
@@ -118,6 +121,8 @@ pub struct Router {
     security: Security,
     /// The redundant bridges of other spaces.
     redundant_senders: BTreeMap<SpaceId, ActiveSender>,
+    /// The bridges of other spaces that carry a part of their space.
+    other_parts: OtherParts,
     /// Whether a value was polled before a call last time.
     value_first: bool,
 }
@@ -138,6 +143,7 @@ impl Router {
             instance: [0; 16],
             security,
             redundant_senders: BTreeMap::new(),
+            other_parts: OtherParts::default(),
             value_first: false,
         }
     }
@@ -204,6 +210,7 @@ impl Router {
     /// Repeats values, sends keep-alives, and detects silent topics that are due by `now`.
     pub fn handle_timeout(&mut self, now: Now) {
         self.look_at_redundancy(now);
+        self.look_at_part(now);
         while let Some(at) = self.values.next_due(now) {
             let topic = at.topic();
             self.announcements
@@ -236,6 +243,7 @@ impl Router {
         let claims = self.values.claims.due(silence);
         let keys = self.security.due();
         let redundancy = self.redundancy_due();
+        let part = self.values.part.as_ref().map(|part| part.due());
         [
             timer,
             pace,
@@ -245,6 +253,7 @@ impl Router {
             claims,
             keys,
             redundancy,
+            part,
         ]
         .into_iter()
         .flatten()

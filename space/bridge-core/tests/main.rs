@@ -30,6 +30,7 @@ mod foreign;
 mod large;
 mod loop_freedom;
 mod metadata;
+mod parts;
 mod publish;
 mod redundancy;
 mod redundant_calls;

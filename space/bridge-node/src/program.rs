@@ -1,6 +1,6 @@
 //! The main function of every program, from the command line to the exit code.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
 use std::fs::File;
 use std::io::Read;
@@ -100,6 +100,12 @@ pub trait Program: Parser {
     /// redundancy.
     fn rank(&self) -> Option<Rank> {
         None
+    }
+
+    /// Returns the namespaces that the program carries because other programs of its space carry
+    /// the others; empty for all namespaces.
+    fn part(&self) -> BTreeSet<u16> {
+        BTreeSet::new()
     }
 
     /// Returns the client of Security Key Services; `None` if the program has none.
@@ -346,6 +352,10 @@ async fn prepare<P: Program>(
     identify(&mut router, program.rank())?;
     if P::SHOWS_VALUES_AT_STANDBY {
         router.show_values_at_standby();
+    }
+    let part = program.part();
+    if !part.is_empty() {
+        router.set_part(part, plain(P::NAME, own).name, now());
     }
     keys.start(&mapping, &mut router)?;
     router.call_the_roll(now());

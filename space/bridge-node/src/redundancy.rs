@@ -1,30 +1,50 @@
 //! The settings of redundant bridges.
 
+use std::collections::BTreeSet;
+
 use bridge_core::Rank;
 use mappings::{Mapping, SpaceId};
 
 use crate::arguments::Flags;
 use crate::exit::{Failure, FailureKind};
 
-/// The argument of a bridge with redundancy.
-#[derive(Debug, Clone, Copy, clap::Args)]
+/// The arguments of a bridge that shares its space with other bridges.
+#[derive(Debug, Clone, clap::Args)]
 #[group(skip)]
 pub struct RedundancyArguments {
     /// Run as one of up to three redundant bridges of the space, of which a single one is active:
     /// 1 for the first host, 2 for the second. All of them have the same mapping and the same group
     #[arg(long, value_name = "1|2|3", env = "UA_RANK", value_parser = rank)]
     pub rank: Option<Rank>,
+    /// Carry only these namespaces in both directions, such as 2,5, because other bridges of the
+    /// space carry the others
+    #[arg(
+        long,
+        value_name = "NUMBERS",
+        env = "UA_NAMESPACES",
+        value_delimiter = ',',
+        value_parser = clap::value_parser!(u16).range(1..),
+        conflicts_with = "rank"
+    )]
+    pub namespaces: Vec<u16>,
 }
 
 impl RedundancyArguments {
-    /// Returns the name of the node of a bridge: the nodes of redundant bridges have different
-    /// names, because a ROS 1 master ends the older of two nodes of a name.
+    /// Returns the name of the node of a bridge: the nodes of bridges that share a space have
+    /// different names, because a ROS 1 master ends the older of two nodes of a name.
     #[must_use]
-    pub fn node_name(self, name: &str) -> String {
-        match self.rank {
-            Some(rank) if rank.get() > 1 => format!("{name}_{}", rank.get()),
-            Some(_) | None => name.to_owned(),
+    pub fn node_name(&self, name: &str) -> String {
+        match (self.rank, self.namespaces.iter().min()) {
+            (Some(rank), _) if rank.get() > 1 => format!("{name}_{}", rank.get()),
+            (None, Some(first)) => format!("{name}_namespace_{first}"),
+            (Some(_), _) | (None, None) => name.to_owned(),
         }
+    }
+
+    /// Returns the namespaces that the bridge carries; empty for all of them.
+    #[must_use]
+    pub fn part(&self) -> BTreeSet<u16> {
+        self.namespaces.iter().copied().collect()
     }
 }
 
@@ -167,5 +187,16 @@ calls:
             bridge.redundancy.node_name("cell")
         });
         assert_eq!(names, ["cell", "cell_2", "cell_3"]);
+    }
+
+    #[test]
+    fn bridges_of_parts_have_different_nodes_and_no_rank() {
+        let bridge = Bridge::try_parse_from(["bridge", "--namespaces", "5,2"]).unwrap();
+        assert_eq!(bridge.redundancy.part(), [2, 5].into());
+        assert_eq!(bridge.redundancy.node_name("cell"), "cell_namespace_2");
+        for wrong in [&["--namespaces", "0"][..], &["--namespaces", "2", "--rank", "1"]] {
+            let words = std::iter::once(&"bridge").chain(wrong);
+            assert!(Bridge::try_parse_from(words).is_err(), "{wrong:?}");
+        }
     }
 }

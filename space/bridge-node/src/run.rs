@@ -557,7 +557,11 @@ impl<P: Port> Shell<P> {
                 Output::CallGone { topic } => self.call_gone(topic),
                 Output::Execute(execution) => self.execute(execution),
                 Output::Abandoned { execution, topic } => self.port.abandoned(execution, topic),
-                Output::Taken { namespace, by } => self.taken(namespace, by),
+                Output::Taken {
+                    namespace,
+                    by,
+                    name,
+                } => self.taken(namespace, by, &name),
             }
         }
         self.flush();

@@ -398,7 +398,11 @@ impl Announcements {
                         announce_call(values, *topic, number);
                     }
                     // If several programs share the space, another program may have the writer.
-                    if topics.is_none() && calls.is_none() && values.owned == Owned::All {
+                    if topics.is_none()
+                        && calls.is_none()
+                        && values.owned == Owned::All
+                        && values.part.is_none()
+                    {
                         values.deny(writer_id, number);
                     }
                 }

@@ -448,6 +448,9 @@ impl Router {
             };
             let namespace = action.writer_group_id.unwrap_or_default();
             let topic = TopicId::new(u16::from(space.get()), namespace, action.writer_id);
+            if self.values.part.is_some() && !self.values.carries(namespace) {
+                continue;
+            }
             match (topic, action.action.kind) {
                 (None, _) => {
                     self.values

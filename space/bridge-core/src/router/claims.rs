@@ -48,6 +48,13 @@ impl Claims {
         matches!(self.of.get(&namespace), Some(Claim::Taken { .. }))
     }
 
+    /// Leaves a namespace to another program that started first. Returns whether that is new.
+    pub(super) fn take(&mut self, namespace: u16, heard: Instant) -> bool {
+        let claim = Claim::Taken { heard };
+        let before = self.of.insert(namespace, claim);
+        !matches!(before, Some(Claim::Taken { .. }))
+    }
+
     /// Records a message of another program. Returns whether the claimed namespace was found to be
     /// taken. A namespace that this program used before the other program stays its own.
     pub(super) fn contend(&mut self, namespace: u16, now: Instant) -> bool {

@@ -76,7 +76,9 @@ impl Router {
         }
         let confirmer = self.values.confirmers.get_mut(&space);
         let counts = confirmer.is_some_and(|of| of.counts(from, now.monotonic));
-        if !counts && !self.is_active_sender(space, from) {
+        let (_, namespace, _) = topic.triple();
+        let is_carrier = self.other_parts.is_carrier((space, namespace), from);
+        if !counts && !is_carrier && !self.is_active_sender(space, from) {
             // The announcement of the bridge may have been lost.
             self.announcements.probe_applications(now);
             let cause = (Reason::Forged, "confirmation");

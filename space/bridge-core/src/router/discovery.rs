@@ -128,12 +128,16 @@ impl Router {
         let own = self.values.settings.own;
         if message.message_type() == NetworkMessageType::Probe {
             self.handle_probe(message, (space, from), now);
+        } else if space == own
+            && (self.is_redundant_peer(from) || self.values.part.is_some())
+            && !self.values.is_source(from)
+        {
+            // Another bridge of the space announces its own part, or what this program announces
+            // when it is active.
         } else if space == own && (self.values.owned == Owned::All || self.values.is_source(from)) {
             if !self.follow_peer(message, None, from, now) {
                 self.values.drop_own(None, from, now);
             }
-        } else if space == own && self.is_redundant_peer(from) {
-            // A redundant server announces what this server announces when it is active.
         } else if message.is_chunk() && !message.is_sealed() {
             self.handle_chunk(message, (space, 0), from, now);
         } else {

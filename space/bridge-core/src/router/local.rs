@@ -35,6 +35,10 @@ impl Values {
         if !self.may_cross(Side::Local, What::Value, topic) {
             return self.refuse(topic, Reason::Looped, String::new());
         }
+        if self.part.is_some() && !self.carries(topic.triple().1) {
+            // Another bridge of the space sends it.
+            return Verdict::Drop(Reason::SpaceTaken);
+        }
         let mut encoded = Encoded {
             bytes: self.buffer(),
             ..Encoded::default()

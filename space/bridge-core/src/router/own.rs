@@ -59,7 +59,12 @@ impl Router {
         for (namespace, again) in self.values.claims.poll(silence, now.monotonic) {
             if again {
                 let by = None;
-                self.values.tell(Output::Taken { namespace, by });
+                let name = String::new();
+                self.values.tell(Output::Taken {
+                    namespace,
+                    by,
+                    name,
+                });
             }
             self.send_again(namespace, again, now);
         }
@@ -112,7 +117,12 @@ impl Values {
     pub(super) fn contend(&mut self, namespace: u16, from: SocketAddr, now: Now) {
         if self.claims.contend(namespace, now.monotonic) {
             let by = Some(from);
-            self.tell(Output::Taken { namespace, by });
+            let name = String::new();
+            self.tell(Output::Taken {
+                namespace,
+                by,
+                name,
+            });
         }
     }
 

@@ -61,7 +61,10 @@ impl Router {
                 .values
                 .count(About::sender(from), late::cause(case), 1, || detail);
         }
-        if self.is_for_all(message, from, now) || self.is_heartbeat(message, from, now) {
+        if self.is_for_all(message, from, now)
+            || self.is_heartbeat(message, from, now)
+            || self.is_part(message, from, now)
+        {
             return;
         }
         let Some(space) = self.values.space_of(&header, from) else {
@@ -79,6 +82,12 @@ impl Router {
             return;
         }
         let namespace = header.group.and_then(|group| group.writer_group_id);
+        if self.values.part.is_some()
+            && namespace.is_some_and(|namespace| !self.values.carries(namespace))
+        {
+            // Another bridge of the space delivers it.
+            return;
+        }
         if self.values.is_ours(space, namespace) {
             // A large request for an own call has the PublisherId of the own space, as a small
             // request has.

@@ -23,6 +23,7 @@ use crate::learned::Learned;
 use crate::loop_rule::Owned;
 use crate::loss::{Loss, Stop, trigger};
 use crate::output::{Delivery, Output};
+use crate::part::OwnPart;
 use crate::pace::Pace;
 use crate::plans::Plans;
 use crate::room::Room;
@@ -52,6 +53,8 @@ pub(super) struct Values {
     pub(super) claims: Claims,
     /// The redundancy of the own space; `None` without redundancy.
     pub(super) redundant: Option<Box<Redundant>>,
+    /// The namespaces that this program carries; `None` for all of them.
+    pub(super) part: Option<Box<OwnPart>>,
     /// The broker between the programs; `None` for a network that does not store messages.
     pub(super) relay: Option<Relay>,
     /// The broker by which the current message was received.
@@ -100,6 +103,7 @@ impl Values {
             pace: Pace::default(),
             claims: Claims::default(),
             redundant: None,
+            part: None,
             relay: None,
             arrival: None,
             forwarding: Forwarding::None,

@@ -354,7 +354,7 @@ impl Cell {
     /// Returns the namespaces that were taken (`true`) or became free (`false`).
     pub(crate) fn taken(&mut self, at: usize) -> Vec<(u16, bool)> {
         self.take(at, |output| match output {
-            Output::Taken { namespace, by } => Some((*namespace, by.is_some())),
+            Output::Taken { namespace, by, .. } => Some((*namespace, by.is_some())),
             _ => None,
         })
     }

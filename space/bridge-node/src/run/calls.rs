@@ -160,8 +160,23 @@ impl<P: Port> Shell<P> {
     }
 
     /// Reports a namespace that another program writes, or that is free again.
-    pub(super) fn taken(&mut self, namespace: u16, by: Option<std::net::SocketAddr>) {
+    pub(super) fn taken(
+        &mut self,
+        namespace: u16,
+        by: Option<std::net::SocketAddr>,
+        name: &str,
+    ) {
         match by {
+            Some(by) if !name.is_empty() => {
+                let program = self.program;
+                let why = format!(
+                    "namespace {namespace} of space {} is carried by {name} ({by}) and by this {program}: this \
+                     program carries nothing in it; list it in --namespaces of one of them only",
+                    self.own
+                );
+                warn!("{why}");
+                self.taken.insert(namespace, why);
+            }
             Some(by) => {
                 let why = format!(
                     "namespace {namespace} of space {} is in use from {by}: this program publishes nothing \

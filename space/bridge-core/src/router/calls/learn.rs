@@ -180,6 +180,10 @@ impl Router {
         if self.values.is_home(topic) {
             return self.values.drop_own(Some(namespace), from, now);
         }
+        if self.values.part.as_ref().is_some_and(|part| !part.has(namespace)) {
+            // Another bridge of the space offers it.
+            return;
+        }
         if !self.may_execute((space, namespace), from, now) {
             // The executor answers the probe. An executor that does not answer in time is lost.
             self.announcements.probe(topic, now);
