@@ -14,6 +14,7 @@ mod malformed;
 mod nodesets;
 mod pubsub;
 mod quality;
+mod redundant;
 mod services;
 mod strangers;
 

@@ -291,7 +291,7 @@ impl Router {
         now: Now,
     ) {
         let begun = match self.is_muted_now(now) {
-            true => Err(takeover::not_asked(!self.values.is_muted_locally())),
+            true => Err(takeover::not_asked(self.values.shows_values())),
             false => self.begin(topic, request, timeout, now),
         };
         let calls = self.calls_mut(now);

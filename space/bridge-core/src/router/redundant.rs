@@ -251,6 +251,12 @@ impl Values {
         redundant.is_some_and(|redundant| redundant.state.mutes_group())
     }
 
+    /// Returns whether the local side takes values while this program is a standby.
+    pub(super) fn shows_values(&self) -> bool {
+        let redundant = self.redundant.as_ref();
+        redundant.is_some_and(|redundant| redundant.shows_values)
+    }
+
     /// Returns whether nothing is published on the local side.
     pub(super) fn is_muted_locally(&self) -> bool {
         let redundant = self.redundant.as_ref();

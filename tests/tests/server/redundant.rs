@@ -1,0 +1,97 @@
+//! Two redundant servers, as asyncua sees them.
+
+use system_tests::{METRICS_SERVER, Started, metrics, program};
+
+use super::*;
+
+const MAPPING: &str = "
+namespaces: {2: urn:ua-bridge:system-tests}
+spaces: [{id: 2}]
+variables:
+  - {node: ns=2;i=10, name: temperature, type: Double, origin: 2}
+  - {node: ns=2;i=30, name: setpoint, type: Double, origin: 0, confirm: none}
+server: {security: [None], redundant: [\"urn:cell:server-1\", \"urn:cell:server-2\"]}
+";
+const ENDPOINTS: [&str; 2] = [SERVER_ENDPOINT, "opc.tcp://127.0.0.1:48499"];
+const METRICS: [&str; 2] = [METRICS_SERVER, "127.0.0.1:9113"];
+const SERVICE_LEVEL: &str = "i=2267";
+const REDUNDANCY_SUPPORT: &str = "i=3709";
+const SERVER_URI_ARRAY: &str = "i=11314";
+const SETPOINT: &str = "ns=2;i=30";
+
+fn start(cell: &Cell, at: usize, mapping: &str) -> Child {
+    let rank = ["1", "2"][at];
+    Started::new("ua-server", &program("ua-server"))
+        .args([mapping, "--rank", rank, "--endpoint", ENDPOINTS[at]])
+        .args(["--pki".into(), cell.folder().join(format!("pki{rank}"))])
+        .args(["--interface", "lo", "--metrics", METRICS[at]])
+        .start()
+}
+
+fn value(cell: &Cell, at: usize, node: &str) -> Option<Value> {
+    let read = cell.asyncua_try("opcua_read.py", &[ENDPOINTS[at], node])?;
+    Some(read.first()?["value"].clone())
+}
+
+fn role(at: usize) -> Option<Value> {
+    Some(metrics(METRICS[at])?["redundancy"]["role"].clone())
+}
+
+fn written(cell: &Cell, at: usize, value: &str) -> Value {
+    let args = [ENDPOINTS[at], SETPOINT, "Double", value];
+    cell.asyncua_once("opcua_write.py", &args)[0]["status"].clone()
+}
+
+/// Waits until a server is active and the other is standby. Returns the active server.
+fn settled() -> usize {
+    eventually("one server is active, the other is standby", SOON, || {
+        let roles = [role(0)?, role(1)?];
+        let active = roles.iter().position(|role| role == "active")?;
+        (roles[1 - active] == "standby").then_some(active)
+    })
+}
+
+#[test]
+fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_writes() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file("redundant.yaml", MAPPING);
+    let mapping = mapping.to_str().unwrap();
+    let mut servers = [Some(start(&cell, 0, mapping)), Some(start(&cell, 1, mapping))];
+    let active = settled();
+    let standby = 1 - active;
+    for at in [active, standby] {
+        eventually("the server describes its redundancy", SOON, || {
+            (value(&cell, at, REDUNDANCY_SUPPORT)? == 3).then_some(())
+        });
+        let uris = value(&cell, at, SERVER_URI_ARRAY);
+        assert_eq!(uris, Some(json!(["urn:cell:server-1", "urn:cell:server-2"])));
+        let own = value(&cell, at, "i=2254").unwrap();
+        assert_eq!(own[0], format!("urn:cell:server-{}", at + 1));
+    }
+    assert_eq!(value(&cell, active, SERVICE_LEVEL), Some(json!(255)));
+    assert_eq!(value(&cell, standby, SERVICE_LEVEL), Some(json!(199)));
+    // Both show the values of the space.
+    let group = UadpSocket::join();
+    group.send(&key_frame(TEMPERATURE, 1, 21.5, DataSetHeader::default()));
+    for at in [active, standby] {
+        eventually("the server shows the value", SOON, || {
+            (value(&cell, at, TEMPERATURE_NODE)? == 21.5).then_some(())
+        });
+    }
+    assert_eq!(written(&cell, standby, "7"), "BadInvalidState");
+    assert_eq!(written(&cell, active, "5"), "Good");
+    // The standby takes over, and has the values.
+    let mut ended = servers[active].take().unwrap();
+    ended.signal(nix::sys::signal::Signal::SIGKILL);
+    ended.wait_for_end(SOON);
+    eventually("the standby is active", SOON, || {
+        (role(standby)? == "active").then_some(())
+    });
+    eventually("its level shows it", SOON, || {
+        (value(&cell, standby, SERVICE_LEVEL)? == 255).then_some(())
+    });
+    assert_eq!(value(&cell, standby, TEMPERATURE_NODE), Some(json!(21.5)));
+    assert_eq!(written(&cell, standby, "8"), "Good");
+}
