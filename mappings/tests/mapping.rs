@@ -38,6 +38,26 @@ fn an_empty_document_is_refused() {
 }
 
 #[test]
+fn redundant_servers_have_two_or_three_different_uris() {
+    let text = |uris: &str| format!("spaces: [{{id: 1}}]\nserver: {{redundant: {uris}}}\n");
+    let mapping = sound(&text("[\"urn:cell:a\", \"urn:cell:b\"]"));
+    let uri = |rank| {
+        let ranked = mapping.for_rank(rank)?;
+        Some(ranked.server().application_uri.clone())
+    };
+    assert_eq!(uri(2).as_deref(), Some("urn:cell:b"));
+    assert_eq!((uri(0), uri(3)), (None, None));
+    for faulty in [
+        "[\"urn:cell:a\"]",
+        "[\"urn:cell:a\", \"urn:cell:a\"]",
+        "[\"urn:cell:a\", \"my server\"]",
+    ] {
+        let checked = Mapping::from_yaml(&text(faulty), "cell.yaml");
+        assert_eq!(codes(&checked), [Code::ApplicationUri], "{faulty}");
+    }
+}
+
+#[test]
 fn a_document_whose_keys_have_no_values_is_zero_configuration() {
     for text in ["{}", "spaces:\nvariables:\n", "pubsub: {}\nserver: ~\n"] {
         let mapping = sound(text);

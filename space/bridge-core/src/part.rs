@@ -21,11 +21,11 @@ use crate::settings::Now;
 /// It is a DataSetMessage of the PublisherId of the space without a WriterGroupId, as the heartbeat
 /// of redundant bridges.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct PartAnnouncement {
+pub(crate) struct PartAnnouncement {
     /// The carried namespaces.
-    pub namespaces: BTreeSet<u16>,
+    pub(crate) namespaces: BTreeSet<u16>,
     /// The name of the program for users.
-    pub name: String,
+    pub(crate) name: String,
     /// The start of the program: the bridge that started first keeps a namespace.
     started: i64,
     instance: u32,

@@ -175,7 +175,7 @@ fn in_a_secured_group_the_new_active_bridge_answers_and_executes_at_once() {
     cell.kill(A);
     // The request reaches no active bridge, and the standby answers it after the takeover.
     cell.ask(CALLER, AskId(2), (weld(), &seam(2)), ms(3_000));
-    cell.run(ms(260));
+    cell.run(ms(450));
     assert_eq!(roles(&cell)[B], Role::Active);
     let answers = cell.answers(CALLER);
     let [(AskId(2), Err(error))] = &answers[..] else {

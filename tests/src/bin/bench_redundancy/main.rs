@@ -147,7 +147,7 @@ fn bench(faults: u64, seed: u64) -> ExitCode {
     pair.settled();
     let numbers = GroupNumbers::of((1, 2, 12), network::READER);
     let count = (faults * 10_000 + 60_000).to_string();
-    let args = ["/ua_1_2_12", "std_msgs/String", "--rate", "1000"];
+    let args = ["/numbers", "std_msgs/String", "--rate", "1000"];
     let mut publisher = cell
         .rospy_started("ros1_pub.py", &args)
         .args(["--numbered", &count, "--warm-up", "\"warm-up\""])
@@ -288,7 +288,7 @@ const MAPPING: &str = "
 spaces: [{id: 1}]
 namespaces: {2: urn:plant}
 variables:
-  - {node: ns=2;i=12, name: Numbers, origin: 1, queue: {drop_oldest: 1000}, ros: {topic: /ua_1_2_12, type: std_msgs/String}}
+  - {node: ns=2;i=12, name: Numbers, origin: 1, queue: {drop_oldest: 1000}, ros: {topic: /numbers, type: std_msgs/String}}
 ";
 const METRICS: [&str; 2] = ["127.0.0.1:9101", "127.0.0.1:9112"];
 const SOON: Duration = Duration::from_secs(60);
