@@ -86,11 +86,7 @@ impl Drop for GroupNumbers {
 }
 
 /// Returns the number in a value of the topic, unless its sequence number was received before.
-fn accept(
-    datagram: &[u8],
-    (space, group, writer): Triple,
-    last: &mut Option<u16>,
-) -> Option<u32> {
+fn accept(datagram: &[u8], (space, group, writer): Triple, last: &mut Option<u16>) -> Option<u32> {
     let message = NetworkMessage::decode(datagram).ok()?;
     let is_ours = message.publisher_id() == Some(PublisherId::UInt16(space))
         && message.group().and_then(|group| group.writer_group_id) == Some(group);

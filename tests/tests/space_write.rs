@@ -187,14 +187,18 @@ fn a_tap_at_the_bridge_shows_the_way_of_a_value() {
     let nobody = tap(&["Arm.Setpoint"]);
     robot.signal(Signal::SIGTERM);
     robot.wait_for_end(SOON);
-    eventually("a command without a subscriber is dropped", SOON * 2, || {
-        let (_, _, _) = write(&[&["Setpoint", "35"][..], &by].concat());
-        let steps = nobody.json_lines();
-        steps
-            .iter()
-            .any(|line| line["reason"] == "no_subscriber")
-            .then_some(())
-    });
+    eventually(
+        "a command without a subscriber is dropped",
+        SOON * 2,
+        || {
+            let (_, _, _) = write(&[&["Setpoint", "35"][..], &by].concat());
+            let steps = nobody.json_lines();
+            steps
+                .iter()
+                .any(|line| line["reason"] == "no_subscriber")
+                .then_some(())
+        },
+    );
     ends_well(nobody);
     let _robot = self::robot(&cell);
     // The bridge knows the name by now.

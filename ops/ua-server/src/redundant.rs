@@ -156,7 +156,12 @@ mod tests {
         let text = "spaces: [{id: 1}]\nserver: {redundant: [\"urn:cell:a\", \"urn:cell:b\"]}\n";
         let mapping = Mapping::from_yaml(text, "cell.yaml").mapping.unwrap();
         let mapping = Arc::new(mapping);
-        let uri = |rank| ranked(&mapping, Rank::new(rank)).server().application_uri.clone();
+        let uri = |rank| {
+            ranked(&mapping, Rank::new(rank))
+                .server()
+                .application_uri
+                .clone()
+        };
         assert_eq!((&uri(1)[..], &uri(2)[..]), ("urn:cell:a", "urn:cell:b"));
         assert_eq!(ranked(&mapping, None), mapping);
     }

@@ -103,7 +103,10 @@ impl PartAnnouncement {
         }
         let name: String = name.chars().filter(|one| !one.is_control()).collect();
         let announcement = Self {
-            namespaces: namespaces.iter().map(|of| u16::from_le_bytes(*of)).collect(),
+            namespaces: namespaces
+                .iter()
+                .map(|of| u16::from_le_bytes(*of))
+                .collect(),
             name,
             started,
             instance,
@@ -167,8 +170,7 @@ impl OwnPart {
         }
         let common = self.own.namespaces.intersection(&other.namespaces);
         let common: Vec<u16> = common.copied().collect();
-        let is_theirs =
-            (other.started, other.instance) < (self.own.started, self.own.instance);
+        let is_theirs = (other.started, other.instance) < (self.own.started, self.own.instance);
         if !common.is_empty() && !is_theirs {
             self.next = self.next.min(now + SOON);
         }

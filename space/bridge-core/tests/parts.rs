@@ -68,9 +68,15 @@ fn each_value_and_command_crosses_the_bridge_of_its_namespace() {
         cell.say(at, command, "go");
         cell.run(ms(50));
         let delivered = [A, B].map(|at| cell.texts(at, command).len());
-        assert_eq!(delivered, [usize::from(namespace == 5), usize::from(namespace == 6)]);
+        assert_eq!(
+            delivered,
+            [usize::from(namespace == 5), usize::from(namespace == 6)]
+        );
     }
-    assert_eq!((overlaps(&mut cell, A), overlaps(&mut cell, B)), (vec![], vec![]));
+    assert_eq!(
+        (overlaps(&mut cell, A), overlaps(&mut cell, B)),
+        (vec![], vec![])
+    );
     for at in [A, B] {
         assert_eq!(cell.dropped(at, Reason::SpaceTaken), 0);
     }
@@ -123,7 +129,10 @@ fn the_bridge_that_started_first_keeps_a_namespace_and_the_other_names_it() {
     cell.run(ms(8_000));
     cell.say(COMMANDER_6, command, "on");
     cell.run(ms(100));
-    assert_eq!(cell.texts(B, command).last().map(String::as_str), Some("on"));
+    assert_eq!(
+        cell.texts(B, command).last().map(String::as_str),
+        Some("on")
+    );
 }
 
 #[test]
@@ -134,7 +143,9 @@ fn a_bridge_of_a_whole_space_names_the_bridge_of_a_part() {
     cell.run(ms(2_000));
     let notices = cell.outputs(5);
     let said = notices.iter().any(|output| match output {
-        Output::Notice(notice) => notice.detail.contains("bridge on port 10002 (127.0.0.1:10002)"),
+        Output::Notice(notice) => notice
+            .detail
+            .contains("bridge on port 10002 (127.0.0.1:10002)"),
         _ => false,
     });
     assert!(said, "{notices:?}");

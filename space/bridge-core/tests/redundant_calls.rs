@@ -69,9 +69,7 @@ const PLAIN: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {5: urn:x, 7: urn:y
 const SECURED: &str = "security: [{group: cell, keys: {file: k}}]\n";
 
 fn redundant(port: u16, rank: u8, mapping: &Arc<Mapping>, cell: &mut Cell) -> Program {
-    let mut program = Program::new(2, Local::Fields)
-        .at_port(port)
-        .mapped(mapping);
+    let mut program = Program::new(2, Local::Fields).at_port(port).mapped(mapping);
     let now = cell.now();
     let rank = Rank::new(rank).unwrap();
     program.router.set_redundancy(rank, now);
@@ -123,9 +121,7 @@ fn is_response(bytes: &[u8]) -> bool {
     }
     let actions = message.actions(ActionDialect::Standard);
     actions.is_ok_and(|mut actions| {
-        actions.any(|action| {
-            action.is_ok_and(|action| action.action.kind == ActionKind::Response)
-        })
+        actions.any(|action| action.is_ok_and(|action| action.action.kind == ActionKind::Response))
     })
 }
 
@@ -305,7 +301,11 @@ fn a_request_without_an_announced_target_is_refused_by_redundant_bridges() {
     assert_eq!(cell.executions(A), []);
     assert_eq!(cell.executions(B), []);
     assert_eq!(cell.dropped(A, Reason::CallRefused), before + 1);
-    assert_eq!(cell.dropped(B, Reason::CallRefused), 0, "the standby is silent");
+    assert_eq!(
+        cell.dropped(B, Reason::CallRefused),
+        0,
+        "the standby is silent"
+    );
 }
 
 #[test]

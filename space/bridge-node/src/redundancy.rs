@@ -194,7 +194,10 @@ calls:
         let bridge = Bridge::try_parse_from(["bridge", "--namespaces", "5,2"]).unwrap();
         assert_eq!(bridge.redundancy.part(), [2, 5].into());
         assert_eq!(bridge.redundancy.node_name("cell"), "cell_namespace_2");
-        for wrong in [&["--namespaces", "0"][..], &["--namespaces", "2", "--rank", "1"]] {
+        for wrong in [
+            &["--namespaces", "0"][..],
+            &["--namespaces", "2", "--rank", "1"],
+        ] {
             let words = std::iter::once(&"bridge").chain(wrong);
             assert!(Bridge::try_parse_from(words).is_err(), "{wrong:?}");
         }

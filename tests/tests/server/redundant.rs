@@ -58,7 +58,10 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
     };
     let mapping = cell.file("redundant.yaml", MAPPING);
     let mapping = mapping.to_str().unwrap();
-    let mut servers = [Some(start(&cell, 0, mapping)), Some(start(&cell, 1, mapping))];
+    let mut servers = [
+        Some(start(&cell, 0, mapping)),
+        Some(start(&cell, 1, mapping)),
+    ];
     let active = settled();
     let standby = 1 - active;
     for at in [active, standby] {
@@ -66,7 +69,10 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
             (value(&cell, at, REDUNDANCY_SUPPORT)? == 3).then_some(())
         });
         let uris = value(&cell, at, SERVER_URI_ARRAY);
-        assert_eq!(uris, Some(json!(["urn:cell:server-1", "urn:cell:server-2"])));
+        assert_eq!(
+            uris,
+            Some(json!(["urn:cell:server-1", "urn:cell:server-2"]))
+        );
         let own = value(&cell, at, "i=2254").unwrap();
         assert_eq!(own[0], format!("urn:cell:server-{}", at + 1));
     }

@@ -27,7 +27,11 @@ impl Router {
     /// Announces the own namespaces if it is due.
     pub(super) fn look_at_part(&mut self, now: Now) {
         let own = self.values.settings.own;
-        let is_due = self.values.part.as_mut().is_some_and(|part| part.poll(now.monotonic));
+        let is_due = self
+            .values
+            .part
+            .as_mut()
+            .is_some_and(|part| part.poll(now.monotonic));
         if !is_due {
             return;
         }
@@ -58,7 +62,8 @@ impl Router {
         if self.security.is_on() && !self.security.is_authentic() {
             let cause = (Reason::Unsecured, "namespaces");
             self.values.count(about, cause, 1, || {
-                "its announcement of namespaces is in clear, and there are secured groups".to_owned()
+                "its announcement of namespaces is in clear, and there are secured groups"
+                    .to_owned()
             });
             return true;
         }

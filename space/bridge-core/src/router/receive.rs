@@ -112,7 +112,8 @@ impl Router {
                 _ if self.follow_peer(message, namespace, from, now) => {}
                 _ if is_request && is_muted => {
                     let cause = (Reason::Takeover, "standby");
-                    self.values.count(About::sender(from), cause, 1, String::new);
+                    self.values
+                        .count(About::sender(from), cause, 1, String::new);
                 }
                 _ => self.values.drop_own(namespace, from, now),
             }

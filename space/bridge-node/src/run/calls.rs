@@ -160,12 +160,7 @@ impl<P: Port> Shell<P> {
     }
 
     /// Reports a namespace that another program writes, or that is free again.
-    pub(super) fn taken(
-        &mut self,
-        namespace: u16,
-        by: Option<std::net::SocketAddr>,
-        name: &str,
-    ) {
+    pub(super) fn taken(&mut self, namespace: u16, by: Option<std::net::SocketAddr>, name: &str) {
         match by {
             Some(by) if !name.is_empty() => {
                 let program = self.program;

@@ -225,7 +225,12 @@ impl Router {
         }
         if self.is_muted_now(now) {
             // Another bridge answers it.
-            return self.count_call(topic, Some(from), (Reason::Takeover, "standby"), String::new);
+            return self.count_call(
+                topic,
+                Some(from),
+                (Reason::Takeover, "standby"),
+                String::new,
+            );
         }
         let (_, namespace, _) = topic.triple();
         let origin = self.origin(namespace, from);
@@ -264,8 +269,10 @@ impl Router {
                 let _told = calls.responder.finish(id, lost, since).is_ok();
                 let cause = (Reason::CallRefused, "earlier life");
                 self.count_call(topic, Some(from), cause, || match is_redundant {
-                    true => "not executed: the request was sent to the bridge that was active before"
-                        .to_owned(),
+                    true => {
+                        "not executed: the request was sent to the bridge that was active before"
+                            .to_owned()
+                    }
                     false => "not executed: the request was sent before this program was restarted"
                         .to_owned(),
                 });

@@ -180,7 +180,12 @@ impl Router {
         if self.values.is_home(topic) {
             return self.values.drop_own(Some(namespace), from, now);
         }
-        if self.values.part.as_ref().is_some_and(|part| !part.has(namespace)) {
+        if self
+            .values
+            .part
+            .as_ref()
+            .is_some_and(|part| !part.has(namespace))
+        {
             // Another bridge of the space offers it.
             return;
         }
@@ -214,8 +219,7 @@ impl Router {
         else {
             return true;
         };
-        let may =
-            group.from == from || is_successor || group.is_silent(now.monotonic, silences);
+        let may = group.from == from || is_successor || group.is_silent(now.monotonic, silences);
         if !may {
             group.doubted.get_or_insert(now.monotonic);
         }
