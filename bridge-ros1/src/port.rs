@@ -77,6 +77,8 @@ pub struct Ros1Port {
     services: Services,
     /// Calls of other spaces, offered as services.
     calls: Calls<ServiceServer>,
+    /// Whether this bridge is one of several redundant bridges of its space.
+    is_redundant: bool,
     /// Services of the graph, executed for other spaces.
     executing: Executing<Executor>,
     /// Actions of other spaces, and action servers of the graph that are executed for other spaces.
@@ -135,6 +137,7 @@ impl Ros1Port {
             definitions,
             services,
             calls: Calls::default(),
+            is_redundant: false,
             executing: Executing::default(),
             actions: Actions::default(),
             ends,
@@ -778,6 +781,10 @@ impl Port for Ros1Port {
         for open in self.sinks.values().filter_map(|sink| sink.open.as_ref()) {
             open.publisher.forget_all_latched();
         }
+    }
+
+    fn role_changed(&mut self, _is_active: bool) {
+        self.is_redundant = true;
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {

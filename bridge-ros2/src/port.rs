@@ -110,6 +110,8 @@ pub struct Ros2Port {
     services: Services,
     /// Calls of other spaces, offered as services.
     calls: Calls<ServiceServer>,
+    /// Whether this bridge is one of several redundant bridges of its space.
+    is_redundant: bool,
     /// Services of the domain, executed for other spaces.
     executing: Executing<Client>,
     /// Actions in both directions.
@@ -191,6 +193,7 @@ impl Ros2Port {
             told_types,
             services,
             calls: Calls::default(),
+            is_redundant: false,
             executing: Executing::default(),
             actions: Actions::default(),
             peers,
@@ -634,6 +637,10 @@ impl Port for Ros2Port {
                 self.events.push_back(lost(*topic, cause, count));
             }
         }
+    }
+
+    fn role_changed(&mut self, _is_active: bool) {
+        self.is_redundant = true;
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {

@@ -9,6 +9,7 @@ use messages::TypeName;
 use tcpros::Graph;
 
 use super::Ros1Port;
+use super::calls::is_redundant_peer;
 use crate::services::Ros1Graph;
 
 impl Ros1Port {
@@ -16,7 +17,9 @@ impl Ros1Port {
     /// server of another node, because both servers would take each goal.
     pub(super) fn offer_actions(&mut self) {
         let (graph, own) = (&self.graph, self.node.name());
-        let other = |action: &str| server(graph, own, action);
+        let is_redundant = self.is_redundant;
+        let is_other = |node: &str| node != own && !(is_redundant && is_redundant_peer(own, node));
+        let other = |action: &str| server_of(graph, is_other, action);
         let is_chosen = |topic: TopicId, action: &str| action != format!("/{topic}");
         for (topic, action) in self.actions.chosen(&self.policy) {
             if let Some(node) = other(&action) {
@@ -93,6 +96,14 @@ pub(super) fn served<'g>(graph: &'g Graph, own: &str) -> impl Iterator<Item = &'
 /// Returns another node that serves the action: it subscribes to goal and cancel, and publishes
 /// status, feedback and result.
 pub(super) fn server<'g>(graph: &'g Graph, own: &str, action: &str) -> Option<&'g str> {
+    server_of(graph, |node| node != own, action)
+}
+
+fn server_of<'g>(
+    graph: &'g Graph,
+    is_other: impl Fn(&str) -> bool,
+    action: &str,
+) -> Option<&'g str> {
     let subscribed = |topic: &str| graph.subscribers.get(&format!("{action}/{topic}"));
     let published = |topic: &str| graph.publishers.get(&format!("{action}/{topic}"));
     let others = [
@@ -103,7 +114,7 @@ pub(super) fn server<'g>(graph: &'g Graph, own: &str, action: &str) -> Option<&'
     ];
     let mut nodes = subscribed("goal")?.iter();
     let found = nodes
-        .find(|node| *node != own && others.iter().all(|names| names.iter().any(|n| n == *node)));
+        .find(|node| is_other(node) && others.iter().all(|names| names.iter().any(|n| n == *node)));
     found.map(String::as_str)
 }
 

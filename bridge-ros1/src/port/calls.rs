@@ -20,9 +20,12 @@ impl Ros1Port {
     /// register.
     pub(super) fn offer_calls(&mut self) {
         let (services, own) = (&self.graph.services, self.node.name());
+        let is_redundant = self.is_redundant;
         let other = |service: &str| {
             let nodes = services.get(service)?;
-            nodes.iter().find(|node| *node != own)
+            nodes
+                .iter()
+                .find(|node| *node != own && !(is_redundant && is_redundant_peer(own, node)))
         };
         let is_chosen = |topic: TopicId, service: &str| service != format!("/{topic}");
         for (topic, service) in self.calls.chosen(&self.policy) {
@@ -90,6 +93,17 @@ impl Ros1Port {
         let events = executing.reconcile(&mut graph, &mut self.policy, (&present, usize::MAX));
         self.events.extend(events);
     }
+}
+
+/// Returns whether a node is a redundant bridge of the space, by its name: NAME, NAME_2 or NAME_3.
+/// The master still lists the services of a bridge that was killed.
+pub(super) fn is_redundant_peer(own: &str, node: &str) -> bool {
+    fn base(name: &str) -> &str {
+        let mut ranks = ["_2", "_3"].into_iter();
+        let stripped = ranks.find_map(|rank| name.strip_suffix(rank));
+        stripped.unwrap_or(name)
+    }
+    own != node && base(own) == base(node)
 }
 
 /// The types of services, which only their servers know.
@@ -199,3 +213,26 @@ const MOST_ASKED: usize = 16;
 const ASKED_WITHIN: Duration = Duration::from_secs(3);
 /// Number of comparisons with the graph until a failed query is repeated.
 const ASKED_AGAIN: u32 = 10;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_nodes_of_redundant_bridges_differ_by_their_rank() {
+        for (own, node) in [
+            ("/cell", "/cell_2"),
+            ("/cell_3", "/cell"),
+            ("/cell_2", "/cell_3"),
+        ] {
+            assert!(is_redundant_peer(own, node), "{own} {node}");
+        }
+        for (own, node) in [
+            ("/cell", "/cell"),
+            ("/cell", "/cell_4"),
+            ("/cell_2", "/arm_2"),
+        ] {
+            assert!(!is_redundant_peer(own, node), "{own} {node}");
+        }
+    }
+}

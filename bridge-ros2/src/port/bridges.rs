@@ -64,6 +64,8 @@ pub(super) struct Bridge {
     pub(super) space: SpaceId,
     /// The participant of this bridge.
     pub(super) participant: GUID,
+    /// Whether other bridges of the space are redundant: only the active one offers calls.
+    pub(super) is_redundant: bool,
 }
 
 impl Bridge {
@@ -81,7 +83,8 @@ impl Bridge {
             let Some(space) = SpaceId::new(number) else {
                 return false;
             };
-            let before = (number, bridge.as_slice()) < own;
+            let is_peer = self.is_redundant && number == own.0;
+            let before = !is_peer && (number, bridge.as_slice()) < own;
             before && is_possible(mapping, space, domain) && {
                 match mapping.call(topic).and_then(|call| call.binding(space)) {
                     Some(binding) => binding.target.name == service,
@@ -138,6 +141,7 @@ mod tests {
         let bridge = |space, first| Bridge {
             space: SpaceId::new(space).unwrap(),
             participant: guid(first),
+            is_redundant: false,
         };
         let mapping = Mapping::default();
         let second = |one: Bridge, others: &[(u16, u8)], service: &str| {

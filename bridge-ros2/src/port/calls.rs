@@ -157,6 +157,7 @@ impl Ros2Port {
         Bridge {
             space: self.policy.own(),
             participant: self.domain.participant().guid(),
+            is_redundant: self.is_redundant,
         }
     }
 
