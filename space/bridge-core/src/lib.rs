@@ -72,7 +72,7 @@ pub use redundancy::{
 };
 pub use room::Room;
 pub use router::{MutedSamples, Router};
-pub use settings::{Forwarding, Local, Now, Relay, Settings};
+pub use settings::{Forwarding, Link, Local, Now, Relay, Settings};
 pub use tap::{Crossing, Tapped};
 pub use uadp::action::{ExecutionId, Refusal};
 pub use uadp::discovery::MessageSecurityMode;

@@ -80,7 +80,8 @@ use crate::tap::{Crossing, Tapped};
 /// - losses outside the Router: [`lost`](Self::lost), [`dropped`](Self::dropped),
 ///   [`unmatched`](Self::unmatched).
 /// - settings: [`replace_mapping`](Self::replace_mapping), [`set_owned`](Self::set_owned),
-///   [`claim`](Self::claim), [`set_part`](Self::set_part), [`set_source`](Self::set_source), [`set_relay`](Self::set_relay),
+///   [`claim`](Self::claim), [`set_part`](Self::set_part), [`set_source`](Self::set_source),
+///   [`set_relay`](Self::set_relay), [`set_link`](Self::set_link),
 ///   [`set_instance`](Self::set_instance), [`set_keys`](Self::set_keys), [`tap`](Self::tap).
 /// - redundancy: [`set_redundancy`](Self::set_redundancy),
 ///   [`show_values_at_standby`](Self::show_values_at_standby), [`set_fit`](Self::set_fit),

@@ -42,6 +42,23 @@ pub enum Forwarding {
     Refused(&'static str),
 }
 
+/// The capacity of the network for the chunks of large messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Link {
+    /// The speed is unknown, as of a wireless link or behind a broker.
+    Unknown,
+    /// A network interface of this speed.
+    Wire {
+        /// Bytes per second.
+        speed: u64,
+    },
+    /// All programs are on this host.
+    Host {
+        /// Bytes of datagrams that the receive buffer of a program holds.
+        receive_buffer: u64,
+    },
+}
+
 /// The payload format of a local side.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Local {

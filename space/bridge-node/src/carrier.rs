@@ -6,13 +6,15 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use std::sync::Arc;
 
+use bridge_core::{Link, Relay};
 use broker::{Identity, Mqtt};
 use mappings::{
     Broker, BrokerAddress, CarrierMedium, ConfiguredCarrier, Mapping, PubSub, SpaceId, UdpGroup,
 };
 use tokio::sync::watch;
 use transport::{
-    Carrier, CarrierRules, Carriers, Judgement, MessagePath, Options, ProcessHub, Udp,
+    Capacity, Carrier, CarrierRules, Carriers, Judgement, MessagePath, Options, ProcessHub,
+    Senders, Udp,
 };
 
 use crate::arguments::Arguments;
@@ -175,4 +177,24 @@ fn udp_options(arguments: &Arguments, group: &UdpGroup, several: bool) -> Result
         return Err(Failure::new(FailureKind::Usage, message));
     }
     Ok(options)
+}
+
+/// Returns the properties of the broker, if the carrier uses one.
+pub(crate) fn relay(carrier: &dyn Carrier) -> Option<Relay> {
+    Some(Relay {
+        within: carrier.within()?,
+        authorized: carrier.senders() == Senders::Authorized,
+        limit: carrier
+            .limit()
+            .map(|limit| u16::try_from(limit).unwrap_or(u16::MAX)),
+    })
+}
+
+/// Returns the capacity of the network of the carrier.
+pub(crate) fn link(carrier: &dyn Carrier) -> Link {
+    match carrier.capacity() {
+        Capacity::Wire(speed) => Link::Wire { speed },
+        Capacity::Host(receive_buffer) => Link::Host { receive_buffer },
+        Capacity::Unknown => Link::Unknown,
+    }
 }

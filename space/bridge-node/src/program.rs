@@ -35,7 +35,7 @@ use crate::observer::Observer;
 use crate::port::Port;
 use crate::redundancy;
 use crate::restart;
-use crate::run::{Fixed, Outbox, Shell, relay};
+use crate::run::{Fixed, Outbox, Shell};
 use crate::service;
 use crate::service_manager;
 use crate::signals;
@@ -348,7 +348,8 @@ async fn prepare<P: Program>(
     let mapping = keys.applied(Arc::clone(&taken));
     let mut router = Router::new(settings, Arc::clone(&mapping));
     router.set_owned(P::owned(&mapping), now());
-    router.set_relay(relay(carrier.as_ref()));
+    router.set_relay(carrier::relay(carrier.as_ref()));
+    router.set_link(carrier::link(carrier.as_ref()));
     identify(&mut router, program.rank())?;
     if P::SHOWS_VALUES_AT_STANDBY {
         router.show_values_at_standby();

@@ -38,7 +38,6 @@ use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, RedundancyStatus, Status};
 use crate::tap::Taps;
 
-pub(crate) use network::relay;
 pub(crate) use outbox::Outbox;
 use outbox::Parcel;
 

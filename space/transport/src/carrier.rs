@@ -96,6 +96,12 @@ pub trait Carrier: fmt::Debug + Send {
         }]
     }
 
+    /// Returns the capacity of the network, which determines how fast the parts of large messages
+    /// are sent.
+    fn capacity(&self) -> Capacity {
+        Capacity::Unknown
+    }
+
     /// Returns the number of messages that the carrier dropped, by reason.
     fn dropped(&self) -> Vec<(&'static str, u64)> {
         Vec::new()
@@ -221,6 +227,18 @@ pub struct Traffic {
     pub forwarded: u64,
 }
 
+/// The capacity of a network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Capacity {
+    /// The network interface has this speed in bytes per second.
+    Wire(u64),
+    /// All receivers are on this host. The receive buffer of this program holds this number of
+    /// bytes, and the buffers of the other programs probably hold as many.
+    Host(u64),
+    /// The speed is unknown.
+    Unknown,
+}
+
 /// A change of the network of a carrier.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CarrierChange {
@@ -272,5 +290,9 @@ impl Carrier for Udp {
 
     fn senders(&self) -> Senders {
         Senders::Addresses
+    }
+
+    fn capacity(&self) -> Capacity {
+        Self::capacity(self)
     }
 }

@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
-use crate::carrier::{Carrier, CarrierChange, Outgoing, Received, Senders};
+use crate::carrier::{Capacity, Carrier, CarrierChange, Outgoing, Received, Senders};
 use crate::udp::{Options, SendError, Udp};
 
 /// The carriers of one process that exchange messages without the network.
@@ -291,6 +291,10 @@ impl<N: HubNetwork> Carrier for InProcess<N> {
 
     fn interface(&self) -> String {
         self.network.interface()
+    }
+
+    fn capacity(&self) -> Capacity {
+        self.network.capacity()
     }
 
     fn senders(&self) -> Senders {

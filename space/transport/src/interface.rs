@@ -69,11 +69,26 @@ impl Interface {
         self.name == wanted || wanted.parse() == Ok(self.address)
     }
 
+    /// Returns the speed in bytes per second, or `None` if the system does not know it.
+    pub(crate) fn speed(&self) -> Option<u64> {
+        let path = std::path::Path::new("/sys/class/net")
+            .join(&self.name)
+            .join("speed");
+        // Mbit/s. An interface without a link has -1, and a wireless interface cannot be read.
+        speed_of(&std::fs::read_to_string(path).ok()?)
+    }
+
     /// Returns true if kernel state of `other` is still valid. A recreated interface has another
     /// index.
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         (&self.name, self.index, self.address) == (&other.name, other.index, other.address)
     }
+}
+
+/// Returns the bytes per second of a speed in Mbit/s.
+fn speed_of(megabits: &str) -> Option<u64> {
+    let megabits: u64 = megabits.trim().parse().ok()?;
+    (megabits > 0).then(|| megabits.saturating_mul(1_000_000 / 8))
 }
 
 /// Returns the IPv4 addresses of the interfaces of this host, in the order of the system.
@@ -108,6 +123,15 @@ mod tests {
             Interface::find(&by_address.name).unwrap().address,
             by_address.address
         );
+    }
+
+    #[test]
+    fn the_speed_is_in_bytes_and_an_interface_without_a_link_has_none() {
+        assert_eq!(speed_of("100\n"), Some(12_500_000));
+        assert_eq!(speed_of("1000\n"), Some(125_000_000));
+        for none in ["-1\n", "0\n", "", "fast\n", "18446744073709551616\n"] {
+            assert_eq!(speed_of(none), None, "{none}");
+        }
     }
 
     #[test]

@@ -15,7 +15,8 @@ mod udp;
 mod watch;
 
 pub use carrier::{
-    Arrival, BUFFER, Carrier, CarrierChange, CarrierState, Outgoing, Received, Senders, Traffic,
+    Arrival, BUFFER, Capacity, Carrier, CarrierChange, CarrierState, Outgoing, Received, Senders,
+    Traffic,
 };
 pub use carriers::{CarrierRules, Carriers, ForwardTo, Judgement, MessagePath};
 pub use in_process::ProcessHub;

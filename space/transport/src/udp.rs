@@ -13,7 +13,7 @@ use tokio::net::UdpSocket;
 use tracing::info;
 
 use crate::batch::{self, Batch};
-use crate::carrier::{Outgoing, Received};
+use crate::carrier::{Capacity, Outgoing, Received};
 use crate::filter::{OwnFilter, ProcessSenders};
 use crate::interface::{Interface, InterfaceError, interfaces};
 use crate::watch::{Change, Wanted, Watch};
@@ -283,6 +283,23 @@ impl Udp {
             .map(|watch| watch.interface().name.clone());
         let named = held.or_else(|| self.options.interface.clone());
         named.unwrap_or_else(|| "the default interface".to_owned())
+    }
+
+    /// Returns the capacity of the network interface that the sockets use.
+    #[must_use]
+    pub fn capacity(&self) -> Capacity {
+        let held = self.watch.as_ref().map(Watch::interface);
+        let loopback = held.is_some_and(|interface| interface.address.is_loopback())
+            || self.targets.iter().all(|target| target.ip().is_loopback());
+        if loopback {
+            // The kernel shows twice the requested size, half of which is for its own records.
+            let granted = socket2::SockRef::from(&self.receiver).recv_buffer_size();
+            return granted.map_or(Capacity::Unknown, |granted| {
+                Capacity::Host(u64::try_from(granted / 2).unwrap_or(u64::MAX))
+            });
+        }
+        held.and_then(Interface::speed)
+            .map_or(Capacity::Unknown, Capacity::Wire)
     }
 
     /// Waits for a datagram. Returns its length and sender. Cancel-safe: no datagram is lost when

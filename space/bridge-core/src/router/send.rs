@@ -6,7 +6,7 @@ use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::network::chunk;
 use crate::output::Output;
-use crate::settings::Now;
+use crate::settings::{Link, Now};
 use crate::tap::Crossing;
 use crate::topic::{Item, Role, Sending};
 use crate::topics::Handle;
@@ -68,6 +68,11 @@ impl Router {
             self.value_first = false;
         }
         next
+    }
+
+    /// Sets the capacity of the network, which determines the pace of chunks.
+    pub fn set_link(&mut self, link: Link) {
+        self.values.pace.follow(link);
     }
 
     /// Returns whether the queue of the topic is full, so that the next sample drops the oldest.

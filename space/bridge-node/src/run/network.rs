@@ -5,6 +5,7 @@ use tracing::{info, warn};
 use transport::{Arrival, Carrier, CarrierChange, Senders};
 
 use super::Shell;
+use crate::carrier::{link, relay};
 use crate::clock::now;
 use crate::port::Port;
 
@@ -38,6 +39,7 @@ impl<P: Port> Shell<P> {
         }
         // A broker may have another limit after each connection.
         self.router.set_relay(relay(self.carrier.as_ref()));
+        self.router.set_link(link(self.carrier.as_ref()));
     }
 
     /// Returns the reasons why carriers are out of reach.
@@ -45,16 +47,6 @@ impl<P: Port> Shell<P> {
         let states = self.carrier.states().into_iter();
         states.filter_map(|state| state.lost).map(group_lost)
     }
-}
-
-/// Returns the properties of the broker, if the carrier uses one.
-pub(crate) fn relay(carrier: &dyn Carrier) -> Option<Relay> {
-    let limit = carrier.limit();
-    Some(Relay {
-        within: carrier.within()?,
-        authorized: carrier.senders() == Senders::Authorized,
-        limit: limit.map(|limit| u16::try_from(limit).unwrap_or(u16::MAX)),
-    })
 }
 
 /// Returns the properties of the broker by which the last message was received, `None` if it was
