@@ -1,6 +1,7 @@
 //! The table of topics.
 
 use std::collections::HashMap;
+use std::time::Duration;
 
 use mappings::TopicId;
 
@@ -138,6 +139,18 @@ impl Topics {
             .collect()
     }
 
+    /// Returns by how much a topic repeats earlier than after `period`, once. Many topics that
+    /// start together are then spread over the period instead of being repeated in a burst.
+    pub(crate) fn lead(&self, at: Handle, period: Duration) -> Duration {
+        if self.index.len() < SPREAD {
+            return Duration::ZERO;
+        }
+        // Multiples of the golden ratio divide the period evenly for any number of slots.
+        let slot = u32::try_from(at.slot).unwrap_or_default();
+        let share = f64::from(slot.wrapping_mul(GOLDEN)) / (f64::from(u32::MAX) + 1.0);
+        period.mul_f64(share)
+    }
+
     /// Returns the counters of datagrams and messages without a topic, and of removed topics.
     pub(crate) const fn others(&self) -> &Counters {
         &self.others
@@ -155,6 +168,11 @@ impl Topics {
         slot.map_or(&mut self.others, |slot| &mut slot.entry.counters)
     }
 }
+
+/// The number of topics from which on their repetitions are spread.
+const SPREAD: usize = 64;
+/// The fraction of the golden ratio, times 2 to the 32.
+const GOLDEN: u32 = 0x9E37_79B9;
 
 #[cfg(test)]
 mod tests {
@@ -191,6 +209,31 @@ mod tests {
         assert!(topics.at(at).is_none());
         assert!(topics.at_mut(other).is_some());
         assert_eq!(topics.handles(), [other]);
+    }
+
+    #[test]
+    fn many_topics_are_spread_over_the_period_and_few_are_not() {
+        let mut topics = Topics::default();
+        let period = Duration::from_secs(1);
+        let add = |topics: &mut Topics, id: u16| {
+            let topic = TopicId::new(1, 5, id).unwrap();
+            topics.insert(topic, self::topic())
+        };
+        let few: Vec<_> = (1..=10).map(|id| add(&mut topics, id)).collect();
+        assert!(few.iter().all(|at| topics.lead(*at, period).is_zero()));
+        for id in 11..=1000 {
+            add(&mut topics, id);
+        }
+        let mut tenths = [0; 10];
+        for at in topics.handles() {
+            let lead = topics.lead(at, period);
+            assert!(lead < period);
+            tenths[usize::try_from(lead.as_millis() / 100).unwrap()] += 1;
+        }
+        assert!(
+            tenths.iter().all(|count| (95..=105).contains(count)),
+            "{tenths:?}"
+        );
     }
 
     #[test]

@@ -34,6 +34,8 @@ pub(crate) struct Writer {
     next: usize,
     /// Whether any sample was sent.
     started: bool,
+    /// Whether the repetitions of the value are spread among those of other topics.
+    is_spread: bool,
     /// The newest event, while it is repeated in case it is lost.
     again: Option<Again>,
     /// The outcome of the newest event, if other spaces confirm it.
@@ -204,6 +206,7 @@ impl Writer {
             kept: Vec::new(),
             next: usize::MAX,
             started: false,
+            is_spread: false,
             again: None,
             arrival: None,
             is_news: false,
@@ -305,6 +308,7 @@ impl Writer {
         self.sent = now;
         self.live = true;
         self.started = true;
+        self.is_spread = false;
         if self.kept.len() <= 1 {
             self.value_sent = now;
         }
@@ -390,6 +394,19 @@ impl Writer {
         self.next = 0;
         self.sent = now;
         self.value_sent = now;
+    }
+
+    /// Sends the next repetition or keep-alive earlier by `lead` than its period says, once after
+    /// each sample: the later ones keep this phase.
+    pub(crate) fn spread(&mut self, idle: Idle, lead: Duration) {
+        if std::mem::replace(&mut self.is_spread, true) {
+            return;
+        }
+        let last = match idle {
+            Idle::Repeat => &mut self.value_sent,
+            Idle::KeepAlive => &mut self.sent,
+        };
+        *last = last.checked_sub(lead).unwrap_or(*last);
     }
 
     /// Returns whether the round of repetitions is incomplete.

@@ -29,6 +29,7 @@ mod fields;
 mod foreign;
 mod large;
 mod loop_freedom;
+mod many;
 mod metadata;
 mod parts;
 mod publish;

@@ -22,6 +22,8 @@ impl Values {
         self.expire_held(at.topic(), now);
         let (key_frames, keep_alives, silence) = self.periods();
         let muted = self.is_muted();
+        let leads = [key_frames, keep_alives].map(|period| self.topics.lead(at, period));
+        let [repeat_lead, keep_alive_lead] = leads;
         let Some(entry) = self.topics.at_mut(at) else {
             return;
         };
@@ -60,9 +62,13 @@ impl Values {
                     return;
                 }
                 match idle {
-                    Idle::Repeat => writer.begin_round(now.monotonic),
+                    Idle::Repeat => {
+                        writer.begin_round(now.monotonic);
+                        writer.spread(idle, repeat_lead);
+                    }
                     Idle::KeepAlive => {
                         writer.spoke(now.monotonic);
+                        writer.spread(idle, keep_alive_lead);
                         let expected = writer.expected_sequence();
                         // Waiting items contain more information than a keep-alive.
                         let buffer = self.buffers.take();
