@@ -10,7 +10,7 @@ mod opening;
 mod reload;
 mod strays;
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -64,7 +64,9 @@ pub struct Ros1Port {
     policy: Policy,
     definitions: Definitions,
     watcher: Watcher,
-    graph: Graph,
+    graph: Arc<Graph>,
+    /// The number of comparisons since the last search for topics in the graph.
+    unsearched: u32,
     /// The subscribed topics, identified by their index. The index of a removed topic is reused.
     sources: Vec<Source>,
     /// The indexes free for reuse.
@@ -102,6 +104,8 @@ pub struct Ros1Port {
     refused: Refused,
     /// When to look at events that wait for subscribers to connect.
     flush_at: Option<tokio::time::Instant>,
+    /// The values with such events.
+    opening: BTreeSet<TopicId>,
 }
 
 impl Ros1Port {
@@ -142,7 +146,8 @@ impl Ros1Port {
             actions: Actions::default(),
             ends,
             kinds: Kinds::default(),
-            graph: Graph::default(),
+            graph: Arc::default(),
+            unsearched: 0,
             sources: Vec::new(),
             vacant: Vec::new(),
             source_of: BTreeMap::new(),
@@ -155,6 +160,7 @@ impl Ros1Port {
             has_master: false,
             refused: Refused::default(),
             flush_at: None,
+            opening: BTreeSet::new(),
         };
         port.take_bindings()?;
         let wanted = port.calls.ask_for_mapped(&port.policy);
@@ -408,14 +414,21 @@ impl Ros1Port {
 
     /// Compares the graph with the open topics. `None` stands for an unavailable master; then the
     /// topics stay unchanged.
-    fn look(&mut self, graph: Option<Graph>) {
+    fn look(&mut self, graph: Option<Arc<Graph>>) {
         self.has_master = graph.is_some();
         if let Some(graph) = graph {
+            // An unchanged graph is searched too, but less often: a subscription may be lost, and a
+            // topic that the limit refused may find room.
+            let unchanged = Arc::ptr_eq(&self.graph, &graph);
             self.graph = graph;
             for source in &mut self.sources {
                 source.looked_at();
             }
-            self.find_sources();
+            self.unsearched += 1;
+            if !unchanged || self.unsearched >= SEARCH {
+                self.unsearched = 0;
+                self.find_sources();
+            }
             self.find_services();
             self.find_actions();
             self.offer_calls();
@@ -588,6 +601,9 @@ fn stranger(
     }
 }
 
+/// The number of comparisons with an unchanged graph until it is searched again.
+const SEARCH: u32 = 4;
+
 impl Port for Ros1Port {
     async fn recv(&mut self) -> PortEvent {
         loop {
@@ -684,8 +700,10 @@ impl Port for Ros1Port {
             open.reached = lost == 0 && open.opening.is_none();
         }
         let is_waiting = open.opening.as_ref().is_some_and(|of| !of.is_empty());
-        if is_waiting && self.flush_at.is_none() {
-            self.flush_at = Some(tokio::time::Instant::now() + FLUSH);
+        if is_waiting {
+            self.opening.insert(sample.topic);
+            self.flush_at
+                .get_or_insert_with(|| tokio::time::Instant::now() + FLUSH);
         }
         if lost > 1 {
             self.unheard(sample.topic, lost - 1);

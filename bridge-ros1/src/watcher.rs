@@ -1,5 +1,6 @@
 //! Polls the ROS graph in separate tasks, so a slow master does not delay samples.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use tcpros::{Graph, Node};
@@ -10,8 +11,9 @@ use tokio::time::sleep;
 /// An event of the watcher.
 #[derive(Debug)]
 pub(crate) enum Seen {
-    /// The graph; `None` while the master is unavailable.
-    Graph(Option<Graph>),
+    /// The graph, the same `Arc` as before if it has not changed; `None` while the master is
+    /// unavailable.
+    Graph(Option<Arc<Graph>>),
     /// The node was requested to shut down, with the reason.
     Ended(String),
 }
@@ -35,10 +37,10 @@ impl Watcher {
             // The port may already be dropped.
             drop(ends.send(Seen::Ended(reason)).await);
         });
-        let graph = node.graph_reader();
+        let mut graph = node.graph_reader();
         tasks.spawn(async move {
             while sender
-                .send(Seen::Graph(graph.read().await.ok()))
+                .send(Seen::Graph(graph.read_again().await.ok()))
                 .await
                 .is_ok()
             {

@@ -4,6 +4,7 @@
 //! Topics in the mapping are never refused. Other topics that are not published give way to new
 //! topics, and refused topics are reported as long as the limit is reached.
 
+use std::collections::HashSet;
 use std::ops::Bound;
 use std::time::{Duration, Instant};
 
@@ -21,6 +22,7 @@ impl Ros1Port {
     /// that are not published.
     pub(super) fn find_sources(&mut self) {
         let mut found = Vec::new();
+        let mut written = None;
         self.refused.topics = 0;
         // The search continues after the last added topic, so each topic gets its turn even beyond
         // the limit.
@@ -43,7 +45,13 @@ impl Ros1Port {
                 Found::Named(topic) => Ok((topic, None, Selection::Whole)),
                 // Other publishers of topics to which values of other spaces are written do not
                 // produce values of this space.
-                Found::Made(_) | Found::Fault(_) if self.is_written(ros_topic) => continue,
+                Found::Made(_) | Found::Fault(_)
+                    if written
+                        .get_or_insert_with(|| self.written())
+                        .contains(ros_topic) =>
+                {
+                    continue;
+                }
                 Found::Made(made) => Ok((made.topic, made.message_type, made.selection)),
                 Found::Fault(fault) => Err(fault.to_string()),
                 Found::Tied(_) | Found::Nothing => continue,
@@ -76,14 +84,12 @@ impl Ros1Port {
         }
     }
 
-    /// Returns true if values of other spaces are written to the topic.
-    fn is_written(&self, ros_topic: &str) -> bool {
-        let mut sinks = self.sinks.values();
-        sinks.any(|sink| {
-            self.node
-                .resolve(&sink.ros_topic)
-                .is_ok_and(|name| name == ros_topic)
-        })
+    /// Returns the topics to which values of other spaces are written.
+    fn written(&self) -> HashSet<String> {
+        let sinks = self.sinks.values();
+        sinks
+            .filter_map(|sink| self.node.resolve(&sink.ros_topic).ok())
+            .collect()
     }
 
     /// Subscribes to a topic without a subscription, if another node publishes it.

@@ -14,18 +14,19 @@ impl Ros1Port {
     pub(super) fn flush(&mut self) {
         let now = bridge_node::now().monotonic;
         let mut unheard = Vec::new();
-        let mut is_waiting = false;
-        for (topic, sink) in &mut self.sinks {
-            let Some(open) = sink.open.as_mut().filter(|open| open.opening.is_some()) else {
-                continue;
+        let sinks = &mut self.sinks;
+        self.opening.retain(|topic| {
+            let sink = sinks.get_mut(topic);
+            let Some(open) = sink.and_then(|sink| sink.open.as_mut()) else {
+                return false;
             };
             unheard.push((*topic, open.look_at_opening(now)));
-            is_waiting |= open.opening.as_ref().is_some_and(|of| !of.is_empty());
-        }
+            open.opening.as_ref().is_some_and(|of| !of.is_empty())
+        });
         for (topic, count) in unheard {
             self.unheard(topic, count);
         }
-        self.flush_at = is_waiting.then(|| Instant::now() + FLUSH);
+        self.flush_at = (!self.opening.is_empty()).then(|| Instant::now() + FLUSH);
     }
 
     /// Drops events that wait for subscribers, because another bridge publishes.
@@ -43,6 +44,7 @@ impl Ros1Port {
             }
         }
         self.flush_at = None;
+        self.opening.clear();
     }
 
     /// Reports events that no subscriber was there for.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use bytes::Bytes;
 use thiserror::Error;
 
 use crate::rpc::{self, Endpoint, RpcError};
@@ -175,14 +176,8 @@ impl Master {
     }
 
     pub(crate) async fn graph(&self) -> Result<Graph, MasterError> {
-        const TYPES: &str = "getTopicTypes";
-        let requests = vec![(STATE, vec![]), (TYPES, vec![])];
-        let (state, types) = match self.call_all(requests).await {
-            Ok(replies) => {
-                let mut replies = replies.into_iter();
-                let mut next = |method| replies.next().ok_or(MasterError::Shape(method))?;
-                (next(STATE)?, next(TYPES)?)
-            }
+        let (state, types) = match self.call_all(graph_requests()).await {
+            Ok(replies) => return graph_of(replies),
             // Each half of a very large graph may be small enough for a reply.
             Err(MasterError::Rpc(RpcError::Body(_))) => (
                 self.call(STATE, vec![]).await?,
@@ -190,11 +185,38 @@ impl Master {
             ),
             Err(error) => return Err(error),
         };
-        let text = |value: &Value| value.as_str().map(str::to_owned);
-        Ok(Graph {
-            types: pairs(&types, text).ok_or(MasterError::Shape(TYPES))?,
-            ..registrations(&state)?
-        })
+        graph_of(vec![Ok(state), Ok(types)])
+    }
+
+    /// Reads the graph as [`graph`](Self::graph) does. A reply that is the same as before is not
+    /// decoded again: the graph of a plant has thousands of names and rarely changes.
+    pub(crate) async fn graph_since(
+        &self,
+        before: &mut Option<(Bytes, Arc<Graph>)>,
+    ) -> Result<Arc<Graph>, MasterError> {
+        let known = before.take();
+        if !self.one_by_one.load(Ordering::Relaxed) {
+            let requests = graph_requests();
+            match self.fetch_all(&requests).await {
+                Ok(document) => {
+                    if let Some((last, graph)) = known
+                        && last == document
+                    {
+                        *before = Some((last, Arc::clone(&graph)));
+                        return Ok(graph);
+                    }
+                    if let Ok(graph) = read_all(&document, &requests).and_then(graph_of) {
+                        let graph = Arc::new(graph);
+                        *before = Some((document, Arc::clone(&graph)));
+                        return Ok(graph);
+                    }
+                }
+                // Too large for one reply.
+                Err(MasterError::Rpc(RpcError::Body(_))) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        self.graph().await.map(Arc::new)
     }
 
     /// Reads the graph without the types.
@@ -247,6 +269,11 @@ impl Master {
         &self,
         requests: &[Request],
     ) -> Result<Vec<Result<Value, MasterError>>, MasterError> {
+        read_all(&self.fetch_all(requests).await?, requests)
+    }
+
+    /// Makes the calls of a multicall, and returns the document of the reply for [`read_all`].
+    async fn fetch_all(&self, requests: &[Request]) -> Result<Bytes, MasterError> {
         let calls = requests.iter().map(|(method, params)| {
             let own = std::iter::once(self.caller_id.as_str().into());
             let params = own.chain(params.iter().cloned()).collect();
@@ -256,15 +283,7 @@ impl Master {
             ])
         });
         let params = vec![Value::Array(calls.collect())];
-        let reply = rpc::call(&self.endpoint, MULTICALL, params, CALL_LIMIT).await?;
-        let Value::Array(replies) = reply else {
-            return Err(MasterError::Shape(MULTICALL));
-        };
-        if replies.len() != requests.len() {
-            return Err(MasterError::Shape(MULTICALL));
-        }
-        let methods = requests.iter().map(|(method, _)| *method);
-        Ok(replies.into_iter().zip(methods).map(unwrap_one).collect())
+        Ok(rpc::fetch(&self.endpoint, MULTICALL, params, CALL_LIMIT).await?)
     }
 
     /// Makes a call with the caller id as its first parameter and unwraps `[code, message,
@@ -278,6 +297,38 @@ impl Master {
         let reply = rpc::call(&self.endpoint, method, params, CALL_LIMIT).await?;
         unwrap_triple(reply, method)
     }
+}
+
+/// Reads the reply to a multicall, with a result for each of the requests.
+fn read_all(
+    document: &[u8],
+    requests: &[Request],
+) -> Result<Vec<Result<Value, MasterError>>, MasterError> {
+    let Value::Array(replies) = rpc::read(document)? else {
+        return Err(MasterError::Shape(MULTICALL));
+    };
+    if replies.len() != requests.len() {
+        return Err(MasterError::Shape(MULTICALL));
+    }
+    let methods = requests.iter().map(|(method, _)| *method);
+    Ok(replies.into_iter().zip(methods).map(unwrap_one).collect())
+}
+
+/// Returns the calls that read the graph.
+fn graph_requests() -> Vec<Request> {
+    vec![(STATE, vec![]), (TYPES, vec![])]
+}
+
+/// Decodes the replies to [`graph_requests`].
+fn graph_of(replies: Vec<Result<Value, MasterError>>) -> Result<Graph, MasterError> {
+    let mut replies = replies.into_iter();
+    let mut next = |method| replies.next().ok_or(MasterError::Shape(method))?;
+    let (state, types) = (next(STATE)?, next(TYPES)?);
+    let text = |value: &Value| value.as_str().map(str::to_owned);
+    Ok(Graph {
+        types: pairs(&types, text).ok_or(MasterError::Shape(TYPES))?,
+        ..registrations(&state)?
+    })
 }
 
 /// Decodes the reply to `getSystemState`: the graph without the types.
@@ -364,6 +415,7 @@ fn pairs<T>(value: &Value, second: impl Fn(&Value) -> Option<T>) -> Option<BTree
 
 const STATE: &str = "getSystemState";
 const MULTICALL: &str = "system.multicall";
+const TYPES: &str = "getTopicTypes";
 const CALL_LIMIT: Duration = Duration::from_secs(3);
 
 #[cfg(test)]
@@ -404,6 +456,36 @@ mod tests {
             master.register_publisher("/a", "std_msgs/Bool"),
             master.register_publisher("/b", "std_msgs/Bool"),
         ]
+    }
+
+    #[tokio::test]
+    async fn the_graph_is_decoded_again_only_after_a_change() {
+        static LOOKS: std::sync::atomic::AtomicUsize = std::sync::atomic::AtomicUsize::new(0);
+        let (master, asked, _tasks) = master(|_| {
+            // The third reply has another topic.
+            let topic = match LOOKS.fetch_add(1, Ordering::Relaxed) {
+                0 | 1 => "/a",
+                _ => "/b",
+            };
+            let pair = Value::Array(vec![topic.into(), Value::Array(vec!["/node".into()])]);
+            let published = Value::Array(vec![pair]);
+            let none = || Value::Array(Vec::new());
+            let answer = |result| {
+                let triple = Value::Array(vec![Value::Int(1), "".into(), result]);
+                Value::Array(vec![triple])
+            };
+            let state = Value::Array(vec![published, none(), none()]);
+            Ok(Value::Array(vec![answer(state), answer(none())]))
+        })
+        .await;
+        let mut before = None;
+        let first = master.graph_since(&mut before).await.unwrap();
+        assert!(first.publishers.contains_key("/a"));
+        let same = master.graph_since(&mut before).await.unwrap();
+        assert!(Arc::ptr_eq(&first, &same));
+        let changed = master.graph_since(&mut before).await.unwrap();
+        assert!(changed.publishers.contains_key("/b"), "{changed:?}");
+        assert_eq!(asked.lock().unwrap().len(), 3, "one request each");
     }
 
     #[tokio::test]

@@ -286,6 +286,7 @@ impl Node {
     pub fn graph_reader(&self) -> GraphReader {
         GraphReader {
             master: self.inner.master.clone(),
+            last: None,
         }
     }
 
@@ -321,6 +322,8 @@ impl Drop for Node {
 #[derive(Clone, Debug)]
 pub struct GraphReader {
     master: Master,
+    /// The last reply of the master, and its graph.
+    last: Option<(Bytes, Arc<Graph>)>,
 }
 
 impl GraphReader {
@@ -328,6 +331,15 @@ impl GraphReader {
     /// master.
     pub async fn read(&self) -> Result<Graph, MasterError> {
         self.master.graph().await
+    }
+
+    /// Returns the current graph as [`read`](Self::read) does, and the same `Arc` as before if it
+    /// has not changed.
+    ///
+    /// # Errors
+    /// Fails without a master.
+    pub async fn read_again(&mut self) -> Result<Arc<Graph>, MasterError> {
+        self.master.graph_since(&mut self.last).await
     }
 }
 

@@ -84,16 +84,30 @@ pub(crate) async fn call(
     params: Vec<Value>,
     limit: Duration,
 ) -> Result<Value, RpcError> {
+    read(&fetch(endpoint, method, params, limit).await?)
+}
+
+/// Calls a method as [`call`] does, and returns the document of its result for [`read`].
+pub(crate) async fn fetch(
+    endpoint: &Endpoint,
+    method: &str,
+    params: Vec<Value>,
+    limit: Duration,
+) -> Result<Bytes, RpcError> {
     let body = Call {
         method: method.to_owned(),
         params,
     }
     .encode();
     let exchange = Box::pin(exchange(endpoint, body));
-    let document = timeout(limit, exchange)
+    timeout(limit, exchange)
         .await
-        .map_err(|_| RpcError::Timeout(limit))??;
-    Ok(parse_response(&document)??)
+        .map_err(|_| RpcError::Timeout(limit))?
+}
+
+/// Reads the result of a call.
+pub(crate) fn read(document: &[u8]) -> Result<Value, RpcError> {
+    Ok(parse_response(document)??)
 }
 
 async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> {
