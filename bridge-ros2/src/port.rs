@@ -402,7 +402,7 @@ impl Ros2Port {
     /// Handles the timer: sends waiting samples and compares the domain with the open endpoints.
     fn look_again(&mut self) {
         let now = Instant::now();
-        if self.schedule.waiting {
+        if self.schedule.is_waiting() {
             self.flush(now);
         }
         let overdue = self.strangers.overdue(now);
@@ -418,15 +418,17 @@ impl Ros2Port {
     }
 
     fn flush(&mut self, now: Instant) {
-        let mut waiting = false;
-        for (topic, sink) in &mut self.sinks {
-            let Some(open) = &mut sink.open else { continue };
+        for topic in self.schedule.waiting() {
+            let sink = self.sinks.get_mut(&topic);
+            let Some(open) = sink.and_then(|sink| sink.open.as_mut()) else {
+                self.schedule.note_waiting(topic, false);
+                continue;
+            };
             if let Err(refusal) = open.outlet.flush(now) {
-                self.events.push_back(lost(*topic, refusal.cause(), 1));
+                self.events.push_back(lost(topic, refusal.cause(), 1));
             }
-            waiting |= open.outlet.is_waiting();
+            self.schedule.note_waiting(topic, open.outlet.is_waiting());
         }
-        self.schedule.waiting = waiting;
     }
 
     /// Returns the local type that a publisher of the space names, if the type is known and has the
@@ -532,7 +534,7 @@ impl Port for Ros2Port {
             (false, None) => open.outlet.offer_once(payload, source, now),
             (false, Some(within)) => open.outlet.offer_in_time(payload, source, (now, within)),
         };
-        self.schedule.waiting |= open.outlet.is_waiting();
+        self.schedule.note_waiting(topic, open.outlet.is_waiting());
         let offered = match offered {
             // An older sample was lost: the new sample must not be offered again.
             Err(Refusal::Overflow) if confirmed.is_some() => {
@@ -618,7 +620,7 @@ impl Port for Ros2Port {
             // subscriber.
             if let Some(open) = sink.open.as_mut().filter(|_| silent) {
                 open.outlet.forget_stored(Instant::now());
-                self.schedule.waiting |= open.outlet.is_waiting();
+                self.schedule.note_waiting(topic, open.outlet.is_waiting());
             }
             sink.silent = silent.then(|| now().monotonic);
         }
@@ -631,7 +633,7 @@ impl Port for Ros2Port {
                 continue;
             };
             let count = open.outlet.drop_waiting(at_once, now);
-            self.schedule.waiting |= open.outlet.is_waiting();
+            self.schedule.note_waiting(*topic, open.outlet.is_waiting());
             if count > 0 {
                 let cause = (Reason::Takeover, "waited in its writer");
                 self.events.push_back(lost(*topic, cause, count));

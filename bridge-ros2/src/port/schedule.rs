@@ -1,9 +1,11 @@
 //! The schedule of the periodic work of the port.
 
+use std::collections::BTreeSet;
 use std::pin::Pin;
 use std::task::Context;
 use std::time::Duration;
 
+use mappings::TopicId;
 use tokio::time::{Instant, Sleep};
 
 /// The times of the next pass and of the next flush.
@@ -14,8 +16,8 @@ pub(super) struct Schedule {
     pub(super) changed: bool,
     /// Endpoints remain to be created.
     pub(super) unfinished: bool,
-    /// Samples wait in an outlet.
-    pub(super) waiting: bool,
+    /// The topics with samples that wait in their outlets.
+    waiting: BTreeSet<TopicId>,
     /// The change count of the domain and the time of the last pass over all topics; `None` forces
     /// the next pass.
     looked: Option<(u64, Instant)>,
@@ -28,7 +30,7 @@ impl Schedule {
             reconciled: Instant::now(),
             changed: true,
             unfinished: false,
-            waiting: false,
+            waiting: BTreeSet::new(),
             looked: None,
         }
     }
@@ -39,7 +41,27 @@ impl Schedule {
         let alike = self.looked.is_some_and(|(before, at)| {
             domain == Some(before) && now.saturating_duration_since(at) < LOOK
         });
-        self.changed || self.unfinished || self.waiting || !alike
+        self.changed || self.unfinished || self.is_waiting() || !alike
+    }
+
+    /// Returns whether samples wait in an outlet.
+    pub(super) fn is_waiting(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
+    /// Records whether samples of a topic wait in its outlet.
+    pub(super) fn note_waiting(&mut self, topic: TopicId, waits: bool) {
+        if waits {
+            self.waiting.insert(topic);
+        } else if self.is_waiting() {
+            self.waiting.remove(&topic);
+        }
+    }
+
+    /// Returns the topics with waiting samples, from which [`note_waiting`](Self::note_waiting)
+    /// removes those without.
+    pub(super) fn waiting(&self) -> Vec<TopicId> {
+        self.waiting.iter().copied().collect()
     }
 
     /// Records the start of a pass over all topics.
@@ -66,7 +88,7 @@ impl Schedule {
 
     fn next(&self, now: Instant) -> Instant {
         let reconcile = self.next_reconcile();
-        if self.waiting {
+        if self.is_waiting() {
             reconcile.min(now + FLUSH)
         } else {
             reconcile
@@ -82,7 +104,7 @@ impl Schedule {
     /// Returns whether work is due; otherwise the task is woken when it is.
     pub(super) fn is_due(&mut self, cx: &mut Context<'_>) -> bool {
         // `publish` and discovery move the time forward.
-        if self.changed || self.unfinished || self.waiting {
+        if self.changed || self.unfinished || self.is_waiting() {
             let now = Instant::now();
             if self.next(now) < self.timer.deadline() {
                 self.arm(now);
@@ -127,10 +149,13 @@ mod tests {
             schedule.looks(Some(1), now);
             assert!(!schedule.is_look_due(Some(1), later));
         }
-        schedule.waiting = true;
+        let topic = "ua_1_2_3".parse().unwrap();
+        schedule.note_waiting(topic, true);
+        assert_eq!(schedule.waiting(), [topic]);
         assert!(schedule.is_look_due(Some(1), later));
         // The published RustDDS provides no change count.
-        schedule.waiting = false;
+        schedule.note_waiting(topic, false);
+        assert!(!schedule.is_waiting());
         schedule.looks(None, now);
         assert!(schedule.is_look_due(None, later));
     }

@@ -43,7 +43,7 @@ impl Ros2Port {
                 Ok(()) => {}
                 Err(refusal) => self.events.push_back(lost(topic, refusal.cause(), 1)),
             }
-            self.schedule.waiting |= open.outlet.is_waiting();
+            self.schedule.note_waiting(topic, open.outlet.is_waiting());
             if open.outlet.is_repairing() {
                 self.schedule.look_next();
             }
@@ -164,6 +164,7 @@ impl Ros2Port {
             .and_then(|sink| sink.open.as_mut())
         {
             open.outlet.replace_writer(writer, now);
+            self.schedule.note_waiting(topic, open.outlet.is_waiting());
         }
         self.schedule.look_next();
         Some(dds_topic)
