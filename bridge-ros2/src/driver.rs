@@ -14,6 +14,11 @@ use std::time::Duration;
 
 use futures_util::task::AtomicWaker;
 use rustdds::{EventLoop, Turned};
+use rustix::io::Errno;
+use rustix::time::{
+    Itimerspec, TimerfdClockId, TimerfdFlags, TimerfdTimerFlags, Timespec, timerfd_create,
+    timerfd_settime,
+};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::task::JoinHandle;
@@ -26,16 +31,20 @@ use tokio::time::{Instant, Sleep};
 /// If the runtime cannot watch the sockets.
 pub(crate) fn spawn(event_loop: EventLoop) -> std::io::Result<JoinHandle<&'static str>> {
     let task = Arc::new(AtomicWaker::new());
+    let watch = |descriptor: OwnedFd| {
+        let watched = watched(descriptor)?;
+        Ok::<_, std::io::Error>(Watched::new(watched, Arc::clone(&task)))
+    };
     let sockets: Result<Vec<_>, std::io::Error> = event_loop
         .descriptors()
         .into_iter()
-        .map(|descriptor| {
-            let socket = watched(descriptor.try_clone_to_owned()?)?;
-            Ok(Watched::new(socket, Arc::clone(&task)))
-        })
+        .map(|descriptor| watch(descriptor.try_clone_to_owned()?))
         .collect();
+    let (alarm, rings) = Alarm::new()?;
     let driver = Driver {
         sockets: sockets?,
+        rings: watch(rings)?,
+        alarm,
         task,
         event_loop,
     };
@@ -55,6 +64,10 @@ struct Driver {
     /// The descriptors of the event loop, each watched by the runtime directly: a nested poll wakes
     /// a thread late.
     sockets: Vec<Watched>,
+    /// For deadlines that the timer of the runtime would miss.
+    alarm: Alarm,
+    /// The descriptor of the alarm.
+    rings: Watched,
     /// The waker that the bells of the sockets call.
     task: Arc<AtomicWaker>,
 }
@@ -82,6 +95,28 @@ impl Watched {
     }
 }
 
+impl Watched {
+    /// Returns whether the descriptor is readable, and clears that; the task is woken when it is
+    /// readable again.
+    fn poll(&self) -> Sockets {
+        if !self.bell.rung.swap(false, Ordering::Acquire) {
+            return Sockets::Quiet;
+        }
+        let mut cx = Context::from_waker(&self.waker);
+        match self.socket.poll_read_ready(&mut cx) {
+            Poll::Ready(Ok(mut ready)) => {
+                // Cleared before the turn, so that data that arrives during it is noticed.
+                ready.clear_ready();
+                // For the next poll, which registers the descriptor again.
+                self.bell.rung.store(true, Ordering::Release);
+                Sockets::Readable
+            }
+            Poll::Ready(Err(_shutting_down)) => Sockets::Gone,
+            Poll::Pending => Sockets::Quiet,
+        }
+    }
+}
+
 struct Bell {
     rung: AtomicBool,
     task: Arc<AtomicWaker>,
@@ -102,10 +137,13 @@ impl Driver {
     async fn run(mut self) -> &'static str {
         let mut timer = Box::pin(tokio::time::sleep(Duration::ZERO));
         loop {
-            let due = Instant::now() + self.event_loop.timeout();
+            let now = Instant::now();
+            let timeout = self.event_loop.timeout();
+            let due = now + timeout;
+            let rings = timeout < SHORT && self.alarm.ring_at(due, now).is_ok();
             // Only an earlier deadline needs the timer wheel; a later deadline is detected when the
             // timer fires.
-            if timer.is_elapsed() || due < timer.deadline() {
+            if !rings && (timer.is_elapsed() || due < timer.deadline()) {
                 timer.as_mut().reset(due);
             }
             if !poll_fn(|cx| self.poll_wake(timer.as_mut(), cx)).await {
@@ -151,26 +189,61 @@ impl Driver {
         self.task.register(cx.waker());
         let mut found = Sockets::Quiet;
         for (index, watched) in self.sockets.iter().enumerate() {
-            if !watched.bell.rung.swap(false, Ordering::Acquire) {
-                continue;
-            }
-            let mut cx = Context::from_waker(&watched.waker);
-            match watched.socket.poll_read_ready(&mut cx) {
-                Poll::Ready(Ok(mut ready)) => {
-                    // Cleared before the turn, so that data that arrives during it is noticed.
-                    ready.clear_ready();
+            match watched.poll() {
+                Sockets::Readable => {
                     self.event_loop.readable(index);
-                    // For the next poll, which registers the descriptor again.
-                    watched.bell.rung.store(true, Ordering::Release);
                     found = Sockets::Readable;
                 }
-                Poll::Ready(Err(_shutting_down)) => return Sockets::Gone,
-                Poll::Pending => {}
+                Sockets::Quiet => {}
+                Sockets::Gone => return Sockets::Gone,
             }
         }
-        found
+        match self.rings.poll() {
+            Sockets::Quiet => found,
+            rung => rung,
+        }
     }
 }
+
+/// A timer of the system. The timer of the runtime counts in milliseconds and fires up to two of
+/// them late; the rounds of fragments of a large sample are a fraction of that apart.
+struct Alarm {
+    timer: OwnedFd,
+    /// The time of the next ring.
+    at: Option<Instant>,
+}
+
+impl Alarm {
+    /// Creates an alarm, and returns a descriptor that becomes readable when it rings.
+    fn new() -> std::io::Result<(Self, OwnedFd)> {
+        let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
+        let timer = timerfd_create(TimerfdClockId::Monotonic, flags)?;
+        let rings = timer.try_clone()?;
+        Ok((Self { timer, at: None }, rings))
+    }
+
+    /// Sets the alarm, unless it rings earlier anyway.
+    fn ring_at(&mut self, due: Instant, now: Instant) -> Result<(), Errno> {
+        if self.at.is_some_and(|at| now < at && at <= due) {
+            return Ok(());
+        }
+        // Zero would switch it off.
+        let left = due
+            .saturating_duration_since(now)
+            .max(Duration::from_nanos(1));
+        let it_value = Timespec::try_from(left).map_err(|_too_long| Errno::INVAL)?;
+        let once = Itimerspec {
+            it_interval: Timespec::default(),
+            it_value,
+        };
+        timerfd_settime(&self.timer, TimerfdTimerFlags::empty(), &once)?;
+        self.at = Some(due);
+        Ok(())
+    }
+}
+
+/// Deadlines that are nearer are set by the alarm.
+const SHORT: Duration = Duration::from_millis(2);
 
 /// Runs the ready tasks without the poll of the sockets that [`yield_now`](tokio::task::yield_now)
 /// performs: a system call for each sample.
@@ -191,4 +264,31 @@ enum Sockets {
     Quiet,
     /// The runtime has ended.
     Gone,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn the_alarm_rings_within_a_fraction_of_a_millisecond_again_and_again() {
+        let (mut alarm, rings) = Alarm::new().unwrap();
+        let rings = watched(rings).unwrap();
+        let mut took = Vec::new();
+        for _ in 0..20 {
+            let now = Instant::now();
+            alarm
+                .ring_at(now + Duration::from_micros(300), now)
+                .unwrap();
+            // A later deadline does not postpone it.
+            alarm.ring_at(now + Duration::from_secs(60), now).unwrap();
+            let ready = tokio::time::timeout(Duration::from_secs(10), rings.readable());
+            ready.await.unwrap().unwrap().clear_ready();
+            took.push(now.elapsed());
+        }
+        assert!(took.iter().all(|took| *took >= Duration::from_micros(300)));
+        // The machine may be busy; the timer of the runtime needs a millisecond each time.
+        let fastest = took.iter().min().unwrap();
+        assert!(*fastest < Duration::from_millis(1), "{took:?}");
+    }
 }
