@@ -239,13 +239,14 @@ mod tests {
 
     /// Returns a graph with this number of published topics of namespace 1, and optionally one
     /// topic of namespace 9.
-    fn graph(made_up: usize, honest: bool) -> Option<Graph> {
+    fn graph(made_up: usize, honest: bool) -> Option<Arc<Graph>> {
         let made_up = (1..=made_up).map(|id| format!("/ua_1_1_{id}"));
         let topics = made_up.chain(honest.then(|| HONEST.to_owned()));
-        Some(Graph {
-            publishers: topics.map(|topic| (topic, vec!["/p".to_owned()])).collect(),
+        let publishers = topics.map(|topic| (topic, vec!["/p".to_owned()]));
+        Some(Arc::new(Graph {
+            publishers: publishers.collect(),
             ..Graph::default()
-        })
+        }))
     }
 
     /// A topic with a single value, which has a standard type.
