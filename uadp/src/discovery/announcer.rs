@@ -39,6 +39,10 @@ pub struct Announcer {
     actions: BTreeSet<u16>,
     /// Planned subjects, and recently announced subjects.
     entries: BTreeMap<Subject, Entry>,
+    /// The planned subjects by time, known subjects first.
+    planned: BTreeSet<(Duration, bool, Subject)>,
+    /// The other subjects by the earliest time of their next announcement.
+    announced: BTreeSet<(Duration, Subject)>,
     /// Number of entries for unknown subjects.
     unknown: usize,
     /// Times of the last announcements, at most as many as the rate allows in 500 ms.
@@ -152,6 +156,8 @@ impl Announcer {
             groups: BTreeSet::new(),
             actions: BTreeSet::new(),
             entries: BTreeMap::new(),
+            planned: BTreeSet::new(),
+            announced: BTreeSet::new(),
             unknown: 0,
             sent: VecDeque::new(),
             sequence_number: 0,
@@ -165,6 +171,8 @@ impl Announcer {
     /// DataSetWriters. The SequenceNumber continues.
     pub fn set_writers(&mut self, writers: impl IntoIterator<Item = (u16, u16)>) {
         self.entries.clear();
+        self.planned.clear();
+        self.announced.clear();
         self.unknown = 0;
         self.writers.clear();
         self.groups.clear();
@@ -333,7 +341,10 @@ impl Announcer {
             if entry.due.is_some() {
                 return Err(AnnounceRefusal::Duplicate);
             }
-            entry.due = Some(due.max(entry.earliest));
+            let due = due.max(entry.earliest);
+            entry.due = Some(due);
+            self.announced.remove(&(entry.earliest, subject));
+            self.planned.insert((due, !entry.known, subject));
             return Ok(());
         }
         let known = self.has(subject);
@@ -350,6 +361,7 @@ impl Announcer {
             known,
         };
         self.entries.insert(subject, entry);
+        self.planned.insert((due, !known, subject));
         Ok(())
     }
 
@@ -370,11 +382,8 @@ impl Announcer {
     /// Returns the subject that is due first. At the same time, known subjects come before unknown
     /// subjects.
     fn next(&self) -> Option<(Duration, Subject)> {
-        let planned = self.entries.iter().filter_map(|(subject, entry)| {
-            let due = entry.due?;
-            Some((due, !entry.known, *subject))
-        });
-        planned.min().map(|(due, _, subject)| (due, subject))
+        let (due, _, subject) = self.planned.first()?;
+        Some((*due, *subject))
     }
 
     /// Returns the DataSetWriters that are announced together with `id`: planned, in the same
@@ -427,21 +436,26 @@ impl Announcer {
         let Some(entry) = self.entries.get_mut(&subject) else {
             return Included::default();
         };
-        entry.due = None;
+        match entry.due.take() {
+            Some(due) => self.planned.remove(&(due, !entry.known, subject)),
+            None => self.announced.remove(&(entry.earliest, subject)),
+        };
         entry.earliest = now.saturating_add(SPACING);
+        self.announced.insert((entry.earliest, subject));
         std::mem::take(&mut entry.included)
     }
 
     /// Removes subjects that were announced long enough ago.
     fn forget(&mut self, now: Duration) {
-        let unknown = &mut self.unknown;
-        self.entries.retain(|_, entry| {
-            let keep = entry.due.is_some() || entry.earliest > now;
-            if !keep && !entry.known {
-                *unknown -= 1;
+        while let Some((earliest, subject)) = self.announced.first().copied()
+            && earliest <= now
+        {
+            self.announced.remove(&(earliest, subject));
+            let entry = self.entries.remove(&subject);
+            if entry.is_some_and(|entry| !entry.known) {
+                self.unknown -= 1;
             }
-            keep
-        });
+        }
     }
 }
 
