@@ -54,8 +54,17 @@ impl BareNode {
     /// Panics if a topic has no subscriber in time.
     #[must_use]
     pub fn publish(&self, topics: &[String]) -> Vec<TcpStream> {
+        self.publish_as(STRING, topics)
+    }
+
+    /// Registers topics of a type, as [`publish`](Self::publish) does.
+    ///
+    /// # Panics
+    /// Panics if a topic has no subscriber in time.
+    #[must_use]
+    pub fn publish_as(&self, message_type: &str, topics: &[String]) -> Vec<TcpStream> {
         for topic in topics {
-            self.register("registerPublisher", topic)
+            self.register("registerPublisher", (topic, message_type))
                 .unwrap_or_else(|| panic!("the master does not take {topic}"));
         }
         let mut subscribers = HashMap::new();
@@ -76,7 +85,12 @@ impl BareNode {
     /// Connects to the first publisher of a topic. Returns `None` while the master knows no
     /// publisher.
     pub fn subscribe(&self, topic: &str) -> Option<BareSubscription> {
-        let reply = self.register("registerSubscriber", topic)?;
+        self.subscribe_as(STRING, topic)
+    }
+
+    /// Connects to a topic of a type, as [`subscribe`](Self::subscribe) does.
+    pub fn subscribe_as(&self, message_type: &str, topic: &str) -> Option<BareSubscription> {
+        let reply = self.register("registerSubscriber", (topic, message_type))?;
         let (_, uri) = reply.split_once("http://")?;
         let address = uri.split(['/', '<']).next()?;
         let protocols = "<array><data><value><array><data><value><string>TCPROS</string></value>\
@@ -90,17 +104,19 @@ impl BareNode {
             ("topic", topic),
             ("tcp_nodelay", "1"),
         ];
-        stream.write_all(&connection_header(&header)).ok()?;
+        stream
+            .write_all(&connection_header(&header, message_type))
+            .ok()?;
         let mut subscription = BareSubscription::of(stream);
         subscription.receive().ok()?;
         Some(subscription)
     }
 
-    fn register(&self, method: &str, topic: &str) -> Option<String> {
+    fn register(&self, method: &str, (topic, message_type): (&str, &str)) -> Option<String> {
         xml_rpc(
             MASTER,
             method,
-            &[&self.name, topic, "std_msgs/String", &self.uri],
+            &[&self.name, topic, message_type, &self.uri],
         )
     }
 }
@@ -172,6 +188,8 @@ impl BareSubscription {
     }
 }
 
+const STRING: &str = "std_msgs/String";
+
 /// Returns a frame with a `std_msgs/String`.
 ///
 /// # Panics
@@ -196,15 +214,23 @@ fn welcome(mut stream: TcpStream, node: &str) -> io::Result<(String, TcpStream)>
     let topic = field(&header, "topic")
         .ok_or_else(|| io::Error::other("a header without a topic"))?
         .to_owned();
-    stream.write_all(&connection_header(&[("callerid", node), ("latching", "0")]))?;
+    // The bridge asks for the type of the mapping.
+    let message_type = field(&header, "type").filter(|name| name.contains('/'));
+    let own = [("callerid", node), ("latching", "0")];
+    stream.write_all(&connection_header(&own, message_type.unwrap_or(STRING)))?;
     Ok((topic, stream))
 }
 
-fn connection_header(fields: &[(&str, &str)]) -> Vec<u8> {
+fn connection_header(fields: &[(&str, &str)], message_type: &str) -> Vec<u8> {
+    // The peer knows the definition of another type.
+    let (sum, definition) = match message_type {
+        STRING => ("992ce8a1687cec8c8bd883ec73ca41d1", "string data\n"),
+        _ => ("*", ""),
+    };
     let typed = [
-        ("type", "std_msgs/String"),
-        ("md5sum", "992ce8a1687cec8c8bd883ec73ca41d1"),
-        ("message_definition", "string data\n"),
+        ("type", message_type),
+        ("md5sum", sum),
+        ("message_definition", definition),
     ];
     let length = |text: &[u8]| u32::try_from(text.len()).unwrap().to_le_bytes();
     let mut header = Vec::new();

@@ -33,6 +33,7 @@ mod plant;
 mod programs;
 mod relay;
 mod rtps;
+mod shape;
 mod stamp;
 mod times;
 mod ua_side;
@@ -68,6 +69,7 @@ pub use programs::{
 };
 pub use relay::{OTHER_GROUP, Relay, Weather};
 pub use rtps::{Mutator, announced, claims_too_much, queued};
+pub use shape::Shape;
 pub use stamp::{Stamp, now};
 pub use times::{Times, micros, per_message, processor_time};
 pub use ua_side::{Triple, UaSide};

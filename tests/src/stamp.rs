@@ -25,6 +25,13 @@ impl Stamp {
         format!("{:.<padding$}{topic:08}{number:012}{sent:016}", "")
     }
 
+    /// Writes a stamp of the current time over the end of a text. Large texts are made once.
+    pub fn renew(text: &mut [u8], number: u64) {
+        if let Some((_, stamp)) = text.split_last_chunk_mut::<LENGTH>() {
+            stamp.copy_from_slice(Self::text(0, number, LENGTH).as_bytes());
+        }
+    }
+
     /// Reads the stamp at the end of a text, if there is a stamp.
     #[must_use]
     pub fn of(text: &[u8]) -> Option<Self> {

@@ -1,6 +1,7 @@
 //! Large samples between our endpoints and third-party endpoints, with the default socket buffers
 //! of a system.
 
+use std::io::Write as _;
 use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
 
@@ -12,7 +13,8 @@ use bridge_ros2::outlet::{Outlet, Refusal};
 use bridge_ros2::qos::{Offered, Requested};
 use bridge_ros2::raw::Payload;
 use system_tests::{
-    Cell, Child, HERE, Host, Peer, THERE, UaSide, WIRE, Wire, eventually, numbered, resident,
+    BareNode, Cell, Child, HERE, Host, METRICS_ROS1, METRICS_ROS2, Peer, Shape, THERE, UaSide,
+    WIRE, Wire, eventually, metrics, numbered, resident,
 };
 use uadp::Scalar;
 
@@ -447,3 +449,65 @@ fn a_listed_peer_is_found_without_multicast() {
             .then_some(())
     });
 }
+
+/// 25 MB/s, which each part of the path carries also on a busy machine.
+#[test]
+fn images_from_ros_1_reach_a_reliable_reader_of_ros_2_complete() {
+    const IMAGES: u64 = 20;
+    const SIZE: usize = 5_000_000;
+    if !patched() {
+        return;
+    }
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::FastDds]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let mapping = cell.file("camera.yaml", CAMERA);
+    let mapping = [mapping.to_str().unwrap()];
+    let _bridges = [cell.bridge_ros1(&mapping), cell.bridge_ros2(&mapping)];
+    let shape = Shape::IMAGE;
+    let arguments = shape.arguments();
+    let mut reads = vec!["meter", "/camera_there", "--depth", "10"];
+    reads.extend(arguments.iter().map(String::as_str));
+    let mut reader = cell.fastdds(&reads);
+    let node = BareNode::start("/camera");
+    let mut streams = node.publish_as(shape.message_type, &["/camera".to_owned()]);
+    let camera = streams.first_mut().unwrap();
+    // Small images, until the path is established.
+    let mut number = 0;
+    let mut small = shape.frame(100);
+    eventually("a small image arrives", SOON, || {
+        shape.stamp(&mut small, number);
+        number += 1;
+        camera.write_all(&small).unwrap();
+        let heard = reader.ask("1 200", SOON);
+        (heard["distinct"] != 0).then_some(())
+    });
+    reader.ask(&format!("{number} 1000"), SOON);
+    let mut image = shape.frame(SIZE);
+    let start = Instant::now();
+    for sent in 0..u32::try_from(IMAGES).unwrap() {
+        let due = start + Duration::from_millis(200) * sent;
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+        shape.stamp(&mut image, number);
+        number += 1;
+        camera.write_all(&image).unwrap();
+    }
+    let heard = reader.ask(&format!("{IMAGES} 10000"), SOON * 2);
+    let statuses = [METRICS_ROS1, METRICS_ROS2].map(metrics);
+    assert_eq!(heard["distinct"], IMAGES, "{heard}: {statuses:?}");
+    assert_eq!(heard["disordered"], 0, "{heard}");
+}
+
+const CAMERA: &str = r#"
+spaces: [{id: 1}, {id: 2}]
+namespaces: {5: "urn:cell"}
+variables:
+  - node: ns=5;i=10
+    name: Camera
+    origin: 1
+    queue: {drop_oldest: 20}
+    ros:
+      - {topic: /camera, type: sensor_msgs/Image}
+      - {space: 2, topic: /camera_there, type: sensor_msgs/Image}
+"#;

@@ -6,6 +6,7 @@
 )]
 
 mod bench;
+mod chart;
 mod comments;
 mod demo;
 mod dist;
@@ -47,10 +48,13 @@ cargo xtask <verb>
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
   bench work [ARGS]              count system calls, wake-ups and CPU of both bridges per message, and of idle programs (perf)
+  bench images [ARGS]            measure images and point clouds through both bridges beside Fast DDS and Cyclone DDS over UDP
   bench opcua [ARGS]             measure ua-server beside servers of asyncua and node-opcua, and what comes from the space to clients
   bench redundancy [FAULTS]      measure the gaps of random faults of two redundant bridges at 1 kHz, 200 unless told
   bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding)
+  bench charts [--check]         draw the pictures of docs/benchmarks.md from its tables; or only check that they are current
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
+  bench bridge-core [--instructions]  measure a message among 10 and among 10 000 topics; only count instructions
   bench messages [--instructions]  measure messages on their way to fields and back, beside memcpy, a tree of values and Python
 ";
 
@@ -84,14 +88,15 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["patches", "--test"] => test::of_all_patches(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),
         ["lint", "--dependencies"] => lint::dependencies(&Workspace::find()?),
-        ["bench", "uadp", rest @ ..] => {
-            instructions::run(&Workspace::find()?, "uadp", rest, |_| Ok(()))
+        ["bench", of @ ("uadp" | "bridge-core"), rest @ ..] => {
+            instructions::run(&Workspace::find()?, of, rest, |_| Ok(()))
         }
+        ["bench", "charts", rest @ ..] => chart::run(&Workspace::find()?, rest),
         ["bench", "messages", rest @ ..] => bench::messages(&Workspace::find()?, rest),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
         ["bench", "ros1", rest @ ..] => bench::ros1(&Workspace::find()?, rest),
-        ["bench", "work", rest @ ..] => {
-            let arguments = [&["work"], rest].concat();
+        ["bench", part @ ("work" | "images"), rest @ ..] => {
+            let arguments = [&[*part], rest].concat();
             bench::ros2(&Workspace::find()?, &arguments)
         }
         ["bench", "opcua", rest @ ..] => bench::opcua(&Workspace::find()?, rest),

@@ -50,6 +50,53 @@ struct Stamp {
     }
 };
 
+// The bytes of a message around a text, which is its data then: --head, whose length is a multiple of 4, and --tail.
+struct Frame {
+    std::string type;
+    Body head;
+    Body tail;
+
+    static Frame from(const Arguments& arguments) {
+        const Frame frame{dds_type("msg", arguments.text("type", "std_msgs/String")), of_hex(arguments.text("head", "")),
+            of_hex(arguments.text("tail", ""))};
+        if (frame.head.size() % 4 != 0) {
+            Arguments::fail("--head is a multiple of 4 bytes");
+        }
+        return frame;
+    }
+
+    bool is_plain() const { return head.empty() && tail.empty(); }
+
+    // The message around a text.
+    Body around(const Body& text) const {
+        Body whole;
+        whole.reserve(head.size() + text.size() + tail.size());
+        whole.insert(whole.end(), head.begin(), head.end());
+        whole.insert(whole.end(), text.begin(), text.end());
+        whole.insert(whole.end(), tail.begin(), tail.end());
+        return whole;
+    }
+
+    // The stamp of a message; its head may differ, as a header does that was made anew.
+    std::optional<Stamp> stamp(const Body& whole) const {
+        if (is_plain()) {
+            return Stamp::of(whole);
+        }
+        if (whole.size() < head.size() + 5 + tail.size()) {
+            return std::nullopt;
+        }
+        const auto begin = whole.begin() + static_cast<ptrdiff_t>(head.size());
+        uint32_t length = 0;
+        std::memcpy(&length, &*begin, sizeof length);
+        const size_t end = head.size() + 4 + length;
+        if (length < Stamp::LENGTH + 1 || end + tail.size() > whole.size()) {
+            return std::nullopt;
+        }
+        Body text = of_text(std::string(reinterpret_cast<const char*>(whole.data()) + end - Stamp::LENGTH - 1, Stamp::LENGTH));
+        return Stamp::of(text);
+    }
+};
+
 // Filler, then a number of 11 digits: with its length and the NUL a text of one is 16 bytes.
 struct Ticket {
     static constexpr size_t LENGTH = 11;
@@ -205,10 +252,10 @@ std::vector<std::string> topics_of(const Arguments& arguments) {
 void pace(const Arguments& arguments) {
     const auto participant = join(arguments);
     const Quality quality = Quality::from(arguments);
+    const Frame frame = Frame::from(arguments);
     std::vector<std::unique_ptr<Writer>> writers;
     for (const auto& topic : topics_of(arguments)) {
-        writers.push_back(
-            participant->writer(dds_topic("rt", topic), dds_type("msg", "std_msgs/String"), quality));
+        writers.push_back(participant->writer(dds_topic("rt", topic), frame.type, quality));
     }
     const bool spread = arguments.has("spread");
     Line().field("ready", writers.size());
@@ -239,7 +286,7 @@ void pace(const Arguments& arguments) {
                     std::this_thread::sleep_until(due + later);
                 }
                 Stamp{topic, number, now()}.put(body, size);
-                refused += writers[topic]->write(body) ? 0 : 1;
+                refused += writers[topic]->write(frame.is_plain() ? body : frame.around(body)) ? 0 : 1;
             }
             due += std::chrono::nanoseconds(period);
         }
@@ -294,16 +341,17 @@ void meter(const Arguments& arguments) {
     const auto participant = join(arguments);
     const Quality quality = Quality::from(arguments);
     const auto topics = topics_of(arguments);
+    const Frame frame = Frame::from(arguments);
     std::mutex lock;
     std::vector<Heard> heard(topics.size());
     std::atomic<uint64_t> count = 0;
     std::atomic<int64_t> last = now();
     std::vector<std::unique_ptr<Reader>> readers;
     for (size_t topic = 0; topic < topics.size(); ++topic) {
-        readers.push_back(participant->reader(dds_topic("rt", topics[topic]), dds_type("msg", "std_msgs/String"),
+        readers.push_back(participant->reader(dds_topic("rt", topics[topic]), frame.type,
             quality, [&, topic](const Sample& sample) {
                 const int64_t arrived = now();
-                if (const auto stamp = Stamp::of(sample.body)) {
+                if (const auto stamp = frame.stamp(sample.body)) {
                     const std::lock_guard<std::mutex> guard(lock);
                     heard[topic].add(*stamp, arrived - stamp->sent);
                     ++count;

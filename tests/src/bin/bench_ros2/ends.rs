@@ -43,6 +43,10 @@ impl Pace {
 }
 
 impl Pacer {
+    pub(crate) const fn of(peer: Child) -> Self {
+        Self(peer)
+    }
+
     pub(crate) fn start(cell: &Cell, topic: &str, more: &[&str]) -> Self {
         let args = ["pace", topic, "--limit", LIMIT];
         Self(cell.cyclone_c(&[&args, more].concat()))
@@ -82,6 +86,10 @@ impl Report {
 }
 
 impl Meter {
+    pub(crate) const fn of(peer: Child) -> Self {
+        Self(peer)
+    }
+
     pub(crate) fn start(cell: &Cell, topic: &str, more: &[&str]) -> Self {
         let args = ["meter", topic, "--limit", LIMIT, "--depth", "2000"];
         Self(cell.cyclone_c(&[&args, more].concat()))
@@ -89,7 +97,17 @@ impl Meter {
 
     /// Waits for this many samples, or for silence, and resets the results.
     pub(crate) fn report(&mut self, expected: u64) -> Report {
-        let answer = self.0.ask(&format!("{expected} {SILENCE_MS}"), PATIENCE);
+        self.wait_for(&format!("{expected} {SILENCE_MS}"), PATIENCE)
+    }
+
+    /// Waits as [`report`](Self::report) does while the samples are sent at a pace. Silence is
+    /// longer then, because the repair of a large sample takes its time.
+    pub(crate) fn report_after(&mut self, pace: Pace, expected: u64) -> Report {
+        self.wait_for(&format!("{expected} {REPAIR_MS}"), pace.took_at_most())
+    }
+
+    fn wait_for(&mut self, line: &str, patience: Duration) -> Report {
+        let answer = self.0.ask(line, patience);
         Report {
             distinct: count(&answer, "distinct"),
             repeated: count(&answer, "repeated"),
@@ -197,3 +215,5 @@ pub(crate) const START: Duration = Duration::from_secs(30);
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 /// Silence after which no more samples are expected.
 pub(crate) const SILENCE_MS: u64 = 1000;
+/// The same for large samples.
+const REPAIR_MS: u64 = 5000;

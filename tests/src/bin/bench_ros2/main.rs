@@ -10,6 +10,7 @@ mod ends;
 mod floods;
 mod goals;
 mod idle;
+mod images;
 mod joining;
 mod many;
 mod relays;
@@ -50,7 +51,7 @@ fn main() -> ExitCode {
         many::measure(&cell, plan.seconds);
     }
     if [
-        "through", "sealed", "bursts", "floods", "calls", "goals", "work",
+        "through", "sealed", "bursts", "floods", "calls", "goals", "work", "images",
     ]
     .iter()
     .any(|part| plan.has(part))
@@ -67,6 +68,9 @@ fn main() -> ExitCode {
         }
         if plan.has("work") {
             work::measure(&cell, plan.seconds);
+        }
+        if plan.has("images") {
+            images::measure(&cell, plan.seconds.min(IMAGES));
         }
         if plan.has("calls") {
             calls::measure(&cell, plan.calls);
@@ -140,7 +144,9 @@ impl Plan {
 
 /// Each flood takes seconds.
 const FLOODS: u64 = 3;
-const PARTS: [&str; 12] = [
+/// The most seconds of each load of images: there are 28 of them.
+const IMAGES: u64 = 10;
+const PARTS: [&str; 13] = [
     "round-trip",
     "throughput",
     "joining",
@@ -153,6 +159,7 @@ const PARTS: [&str; 12] = [
     "calls",
     "goals",
     "work",
+    "images",
 ];
 
 const HELP: &str = "\
@@ -161,5 +168,5 @@ bench-ros2 [--quick] [--seconds N] [--turn N] [PART..]
   --quick      a trial of a minute; its figures are no measurement
   --seconds N  how long each path gets messages at 1 kHz, 20 unless told
   --turn N     samples through one relay before the next has its turn, 50 unless told
-  PART         round-trip, throughput, joining, idle, many, through, sealed, bursts, floods, calls, goals, work; all unless told
+  PART         round-trip, throughput, joining, idle, many, through, sealed, bursts, floods, calls, goals, work, images; all unless told
 ";
