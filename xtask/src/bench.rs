@@ -9,11 +9,11 @@ use std::{
 use anyhow::{Context as _, ensure};
 
 use crate::{
-    instructions, links,
+    chart, instructions, links,
     namespace::{Namespaces, REFUSED},
     patches::Patched,
     peers,
-    shell::{Ended, run as must, status, step},
+    shell::{Ended, run as must, step},
     workspace::{SHIPPED, Workspace},
 };
 
@@ -140,5 +140,5 @@ fn measured(
         .env("UA_BIN_DIR", &programs)
         .env("UA_PEERS_PYTHON", peers::python(workspace))
         .env("UA_PEERS", workspace.peers());
-    Ok(status(&mut command)?.into())
+    chart::measured(&mut command, workspace, bench)
 }

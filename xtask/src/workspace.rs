@@ -45,7 +45,7 @@ impl Workspace {
 
     /// Returns the folder of a crate that has a benchmark of its own.
     pub(crate) fn folder(&self, of: &str) -> PathBuf {
-        let below = ["ros"].map(|folder| self.root.join(folder).join(of));
+        let below = ["ros", "space"].map(|folder| self.root.join(folder).join(of));
         let found = below.into_iter().find(|folder| folder.is_dir());
         found.unwrap_or_else(|| self.root.join(of))
     }
