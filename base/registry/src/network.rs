@@ -28,14 +28,14 @@ pub struct NetworkRecord {
 pub(crate) struct Network {
     records: BTreeMap<String, NetworkRecord>,
     /// First announcement of each name.
-    arrivals: BTreeMap<String, Arrival>,
+    arrivals: BTreeMap<String, FirstAnnouncement>,
     last_arrival: u64,
     last_id: u32,
 }
 
 /// First announcement of a name, and the endpoint of its server.
 #[derive(Debug)]
-pub(crate) struct Arrival {
+pub(crate) struct FirstAnnouncement {
     /// Ascending with each name.
     pub(crate) order: u64,
     pub(crate) since: Instant,
@@ -57,7 +57,7 @@ impl Network {
             arrival.place = place;
         } else {
             self.last_arrival += 1;
-            let arrival = Arrival {
+            let arrival = FirstAnnouncement {
                 order: self.last_arrival,
                 since: now,
                 place,
@@ -83,7 +83,7 @@ impl Network {
     }
 
     /// Returns all records with their arrivals.
-    pub(crate) fn arrivals(&self) -> impl Iterator<Item = (&NetworkRecord, &Arrival)> {
+    pub(crate) fn arrivals(&self) -> impl Iterator<Item = (&NetworkRecord, &FirstAnnouncement)> {
         // Both have the same keys.
         self.records.values().zip(self.arrivals.values())
     }

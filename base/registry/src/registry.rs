@@ -10,7 +10,7 @@ use crate::asked::{Asked, Channel, RegisterFault};
 use crate::loss::Loss;
 use crate::name::{label, renamed};
 use crate::network::{Announcement, Network, NetworkRecord, place};
-use crate::watch::{Outcome, Patience, Probe, Sign, Watch};
+use crate::watch::{EndpointWatch, Outcome, Patience, Probe, Sign};
 
 /// Limits and time limits of a registry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -115,7 +115,7 @@ pub struct Registry {
     /// registration expires.
     away: BTreeMap<String, Server>,
     network: Network,
-    watch: Watch,
+    watch: EndpointWatch,
     events: VecDeque<Event>,
     refused: u64,
     displaced: u64,
@@ -149,7 +149,7 @@ impl Registry {
             servers: BTreeMap::new(),
             away: BTreeMap::new(),
             network: Network::default(),
-            watch: Watch::default(),
+            watch: EndpointWatch::default(),
             events: VecDeque::new(),
             refused: 0,
             displaced: 0,

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 /// The properties of an entry that decide about its displacement.
 #[derive(Debug)]
-pub(crate) struct Entry<'e> {
+pub(crate) struct ShareEntry<'e> {
     /// The name of the entry.
     pub(crate) key: &'e str,
     /// Host and port of its endpoint.
@@ -33,7 +33,7 @@ pub(crate) struct Newcomer<'e> {
 
 /// Decision about a new entry.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Verdict {
+pub(crate) enum AdmissionVerdict {
     /// The entry is accepted.
     Room,
     /// The entry is accepted and displaces this entry.
@@ -44,18 +44,18 @@ pub(crate) enum Verdict {
 
 /// Decides on a new entry of a table of at most `most`.
 pub(crate) fn admit(
-    entries: &[Entry<'_>],
+    entries: &[ShareEntry<'_>],
     newcomer: &Newcomer<'_>,
     most: usize,
     now: Instant,
-) -> Verdict {
+) -> AdmissionVerdict {
     let at_place = entries
         .iter()
         .filter(|entry| entry.place == newcomer.place && !entry.is_certified)
         .count();
     let is_nearly_full = entries.len() >= most - most / 4;
     if at_place < PLACE_SHARE && !is_nearly_full {
-        return Verdict::Room;
+        return AdmissionVerdict::Room;
     }
     // The first entry of a live endpoint is verified; further names of the endpoint are not.
     let mut firsts: HashMap<&str, u64> = HashMap::new();
@@ -65,11 +65,11 @@ pub(crate) fn admit(
         *first = entry.arrival.0.min(*first);
         *senders.entry(entry.sender).or_default() += 1;
     }
-    let is_kept = |entry: &&Entry<'_>| {
+    let is_kept = |entry: &&ShareEntry<'_>| {
         let is_first = firsts.get(entry.place) == Some(&entry.arrival.0);
         entry.is_certified || (entry.is_live && is_first)
     };
-    let oldest = |wanted: &dyn Fn(&Entry<'_>) -> bool| {
+    let oldest = |wanted: &dyn Fn(&ShareEntry<'_>) -> bool| {
         let unverified = entries.iter().filter(|entry| !is_kept(entry));
         let oldest = unverified
             .filter(|entry| wanted(entry))
@@ -77,7 +77,9 @@ pub(crate) fn admit(
         oldest.map(|entry| (entry.key.to_owned(), entry.arrival.1))
     };
     let instead = |found: Option<(String, Instant)>| {
-        found.map_or(Verdict::Full, |(key, _)| Verdict::InsteadOf(key))
+        found.map_or(AdmissionVerdict::Full, |(key, _)| {
+            AdmissionVerdict::InsteadOf(key)
+        })
     };
     if at_place >= PLACE_SHARE {
         // A flood of names for an endpoint exchanges them slowly.
@@ -88,7 +90,7 @@ pub(crate) fn admit(
     if entries.len() < most {
         return match own >= most / 2 {
             true => instead(oldest(&|entry| entry.sender == newcomer.sender)),
-            false => Verdict::Room,
+            false => AdmissionVerdict::Room,
         };
     }
     // The sender with the largest share loses an entry.
@@ -115,9 +117,9 @@ mod tests {
     )]
     use super::*;
 
-    fn entry(key: &str, place: &str, number: u64, since: Instant) -> Entry<'static> {
+    fn entry(key: &str, place: &str, number: u64, since: Instant) -> ShareEntry<'static> {
         let leak = |text: &str| -> &'static str { Box::leak(text.to_owned().into_boxed_str()) };
-        Entry {
+        ShareEntry {
             key: leak(key),
             place: leak(place),
             sender: leak(place.split(':').next().unwrap()),
@@ -153,33 +155,33 @@ mod tests {
             ));
         }
         let verdict = admit(&all, &new("c:1"), 8, now);
-        assert_eq!(verdict, Verdict::InsteadOf("forged 4".to_owned()));
+        assert_eq!(verdict, AdmissionVerdict::InsteadOf("forged 4".to_owned()));
         all.truncate(2);
-        assert_eq!(admit(&all, &new("c:1"), 2, now), Verdict::Full);
+        assert_eq!(admit(&all, &new("c:1"), 2, now), AdmissionVerdict::Full);
     }
 
     #[test]
     fn one_sender_leaves_a_quarter_of_the_table_to_others() {
         let now = Instant::now();
-        let mut all: Vec<Entry<'_>> = (0..12)
+        let mut all: Vec<ShareEntry<'_>> = (0..12)
             .map(|number| entry(&number.to_string(), &format!("a:{number}"), number, now))
             .collect();
         all.iter_mut().for_each(|one| one.is_live = true);
-        assert_eq!(admit(&all, &new("a:99"), 16, now), Verdict::Full);
-        assert_eq!(admit(&all, &new("b:1"), 16, now), Verdict::Room);
+        assert_eq!(admit(&all, &new("a:99"), 16, now), AdmissionVerdict::Full);
+        assert_eq!(admit(&all, &new("b:1"), 16, now), AdmissionVerdict::Room);
     }
 
     #[test]
     fn names_of_one_endpoint_exchange_slowly_and_never_the_first() {
         let now = Instant::now();
-        let mut all: Vec<Entry<'_>> = (0..16)
+        let mut all: Vec<ShareEntry<'_>> = (0..16)
             .map(|number| entry(&number.to_string(), "a:1", number, now))
             .collect();
         all[0].is_live = true;
-        assert_eq!(admit(&all, &new("a:1"), 1024, now), Verdict::Full);
+        assert_eq!(admit(&all, &new("a:1"), 1024, now), AdmissionVerdict::Full);
         let later = now + EXCHANGE_AFTER;
         let verdict = admit(&all, &new("a:1"), 1024, later);
-        assert_eq!(verdict, Verdict::InsteadOf("1".to_owned()));
-        assert_eq!(admit(&all, &new("a:2"), 1024, now), Verdict::Room);
+        assert_eq!(verdict, AdmissionVerdict::InsteadOf("1".to_owned()));
+        assert_eq!(admit(&all, &new("a:2"), 1024, now), AdmissionVerdict::Room);
     }
 }

@@ -61,7 +61,7 @@ pub(crate) struct Patience {
 /// The supervised endpoints, by host and port: URLs that differ only in their path are one
 /// endpoint, which is probed once.
 #[derive(Debug, Default)]
-pub(crate) struct Watch {
+pub(crate) struct EndpointWatch {
     endpoints: BTreeMap<String, Watched>,
     pauses: BTreeMap<String, Pause>,
     /// End of the time that is used by the previous probes.
@@ -95,7 +95,7 @@ struct Watched {
     answers_during_calls: bool,
 }
 
-impl Watch {
+impl EndpointWatch {
     /// Supervises the endpoint of a URL. An announcement is a sign of life only the first time,
     /// because it outlives its server. The first probes of many new endpoints are spread.
     pub(crate) fn add(&mut self, url: &str, every: Duration, now: Instant) {

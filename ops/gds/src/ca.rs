@@ -12,7 +12,7 @@ use trust::{Certificate, Request, Serial};
 use crate::Folders;
 use crate::serve::of_store;
 use crate::service::now;
-use crate::store::{Issued, Store, new_key, pem_of, write_key};
+use crate::store::{AuthorityStore, Issued, new_key, pem_of, write_key};
 
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum CaVerb {
@@ -85,7 +85,7 @@ pub(crate) fn run(verb: CaVerb) -> Result<(), Failure> {
             folders,
         } => {
             let folder = folders.authority();
-            let made = Store::init(&folder, (&name, &organization), now(), of_days(days));
+            let made = AuthorityStore::init(&folder, (&name, &organization), now(), of_days(days));
             let store = made.map_err(|fault| of_store(&fault))?;
             say(&format!(
                 "made: {:?}, valid until {}",
@@ -146,8 +146,8 @@ pub(crate) fn run(verb: CaVerb) -> Result<(), Failure> {
     }
 }
 
-pub(crate) fn open(folders: &Folders) -> Result<Store, Failure> {
-    Store::open(&folders.authority()).map_err(|fault| of_store(&fault))
+pub(crate) fn open(folders: &Folders) -> Result<AuthorityStore, Failure> {
+    AuthorityStore::open(&folders.authority()).map_err(|fault| of_store(&fault))
 }
 
 fn read_request(file: &Path) -> Result<Request, Failure> {

@@ -5,11 +5,13 @@ use plant_opcua::server::{Caller, MethodRequest};
 use tracing::info;
 
 use crate::records::{Query, Record, check};
-use crate::service::{Answer, Gds, Standing, id, number, refused, texts, time, unregistered};
+use crate::service::{
+    CallerStanding, Gds, MethodResult, id, number, refused, texts, time, unregistered,
+};
 use plant_opcua::directory::ApplicationRecord;
 
 /// FindApplications: returns the applications with an ApplicationUri.
-pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::String(uri)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
     };
@@ -20,13 +22,13 @@ pub(crate) fn find(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 /// RegisterApplication: returns the ApplicationId.
-pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn register(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let id = gds.register(&request.caller, Record::of(record(request)?, 0))?;
     Ok(vec![Variant::from(id)])
 }
 
 /// UpdateApplication: changes everything except the ApplicationUri.
-pub(crate) fn update(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn update(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let told = record(request)?;
     let known = gds.own(&request.caller, &told.application_id)?;
     gds.update(&request.caller, Record::of(told, known.number))?;
@@ -45,13 +47,13 @@ impl Gds {
         mut record: Record,
     ) -> Result<NodeId, StatusCode> {
         match self.standing(caller, &record.uri)? {
-            Standing::Administrator => record.confirm(&record.hosts()),
-            Standing::Itself => {}
-            Standing::Applicant(key) => {
+            CallerStanding::Administrator => record.confirm(&record.hosts()),
+            CallerStanding::Itself => {}
+            CallerStanding::Applicant(key) => {
                 check(&record).map_err(|fault| unregistered(&fault, caller))?;
                 return Ok(self.applicants.lock().put(record, key));
             }
-            Standing::Stranger => return Err(StatusCode::BadUserAccessDenied),
+            CallerStanding::Stranger => return Err(StatusCode::BadUserAccessDenied),
         }
         let (uri, urls) = (record.uri.clone(), record.urls.clone());
         let registered = self.records.lock().register(record);
@@ -78,7 +80,7 @@ impl Gds {
 }
 
 /// UnregisterApplication: its certificates are revoked (OPC 10000-12, 6.6.8).
-pub(crate) fn unregister(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn unregister(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::NodeId(id)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
     };
@@ -95,7 +97,7 @@ pub(crate) fn unregister(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 /// GetApplication: returns the application with an ApplicationId.
-pub(crate) fn get(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn get(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::NodeId(id)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
     };
@@ -107,7 +109,7 @@ pub(crate) fn get(gds: &Gds, request: &MethodRequest) -> Answer {
 
 /// QueryApplications: returns the descriptions of applications, and the number after which the next
 /// query continues.
-pub(crate) fn query(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn query(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [
         Variant::UInt32(after),
         Variant::UInt32(most),
@@ -137,7 +139,7 @@ pub(crate) fn query(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 /// QueryServers: returns servers only, in the form of FindServersOnNetwork (OPC 10000-12, 6.6.11).
-pub(crate) fn query_servers(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn query_servers(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [
         Variant::UInt32(after),
         Variant::UInt32(most),

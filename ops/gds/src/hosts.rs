@@ -160,9 +160,9 @@ mod tests {
     use crate::invitations::{self, Invitations, RANDOM};
     use crate::kept;
     use crate::records::Records;
-    use crate::requests::{FILE, Requests, State};
-    use crate::service::{Standing, now};
-    use crate::store::{Store, new_key};
+    use crate::requests::{FILE, RequestState, SigningRequests};
+    use crate::service::{CallerStanding, now};
+    use crate::store::{AuthorityStore, new_key};
 
     const YEAR: Duration = Duration::from_secs(365 * 86_400);
     const URI: &str = "urn:cell:robot";
@@ -179,7 +179,8 @@ mod tests {
             let folder = format!("ua-gds-hosts-{}-{name}", std::process::id());
             let folder = std::env::temp_dir().join(folder);
             drop(fs::remove_dir_all(&folder));
-            let store = Store::init(&folder, ("Plant authority", ""), now(), YEAR).unwrap();
+            let store =
+                AuthorityStore::init(&folder, ("Plant authority", ""), now(), YEAR).unwrap();
             let pki = folder.join("pki");
             fs::create_dir_all(&pki).unwrap();
             let records = Records::open(folder.join("applications.json"), now().as_secs());
@@ -240,15 +241,16 @@ mod tests {
             issued.map(|issued| issued.hosts())
         }
 
-        fn registered(&self, caller: &Caller) -> (Record, Standing) {
+        fn registered(&self, caller: &Caller) -> (Record, CallerStanding) {
             let record = self.gds.records.lock().of_uri(URI).next().cloned();
             (record.unwrap(), self.gds.standing(caller, URI).unwrap())
         }
 
         fn approve(&self, number: u32) {
-            let decided = kept::change(&self.folder.join(FILE), |all: &mut Requests| {
+            let decided = kept::change(&self.folder.join(FILE), |all: &mut SigningRequests| {
                 let by = "the command line".to_owned();
-                all.decide(number, State::Approved { by }, now()).is_some()
+                all.decide(number, RequestState::Approved { by }, now())
+                    .is_some()
             });
             assert!(decided.unwrap());
         }
@@ -377,7 +379,7 @@ mod tests {
         let request = gds.ask(&stranger, asked, wanted.unwrap()).unwrap();
         assert_eq!(site.fetch(&stranger, request).unwrap(), hosts);
         let (known, standing) = site.registered(&stranger);
-        assert_eq!(standing, Standing::Itself);
+        assert_eq!(standing, CallerStanding::Itself);
         assert_eq!(known.confirmed, hosts);
 
         let both = ["robot.cell", "mes.cell"];

@@ -32,7 +32,7 @@ use plant_opcua::server::EndpointUrl;
 
 use crate::ca::CaVerb;
 use crate::people::PeopleVerb;
-use crate::serve::{Settings, serve};
+use crate::serve::{GdsSettings, serve};
 
 /// The Global Discovery Server of a plant: registers its applications, and issues and revokes their certificates.
 ///
@@ -133,7 +133,7 @@ impl Service for UaGds {
             return done
                 .unwrap_or_else(|error| Err(Failure::new(FailureKind::Io, error.to_string())));
         }
-        let settings = Settings {
+        let settings = GdsSettings {
             pki: self.folders.pki(),
             authority: self.folders.authority(),
             endpoint: self.endpoint,

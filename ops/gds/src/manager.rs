@@ -13,12 +13,12 @@ use trust::{Certificate, Fault, Fingerprint, Known, Renewal, Request, Step};
 use crate::invitations::{self, Invitations, Shows};
 use crate::kept;
 use crate::records::Record;
-use crate::requests::{self, Asked, Requests, State, Wanted};
-use crate::service::{Answer, Gds, OWN, Standing, now, number, refused, texts, time};
+use crate::requests::{self, NewRequest, RequestState, SigningRequest, SigningRequests};
+use crate::service::{CallerStanding, Gds, MethodResult, OWN, now, number, refused, texts, time};
 use crate::store::{new_key, pem_of};
 
 /// StartSigningRequest: stores the request and returns the RequestId.
-pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn start_signing(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [
         Variant::NodeId(application),
         Variant::NodeId(group),
@@ -45,7 +45,7 @@ pub(crate) struct StartNewKeyPair(pub(crate) Arc<Gds>);
 
 #[async_trait]
 impl MethodHandler for StartNewKeyPair {
-    async fn call(&self, request: MethodRequest) -> Answer {
+    async fn call(&self, request: MethodRequest) -> MethodResult {
         let gds = &self.0;
         let [
             Variant::NodeId(application),
@@ -88,7 +88,7 @@ impl MethodHandler for StartNewKeyPair {
 
 /// FinishRequest: issues the certificate. Returns it with its key, if the key was created here, and
 /// with the authority.
-pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::NodeId(application), Variant::NodeId(id)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
     };
@@ -107,7 +107,7 @@ pub(crate) fn finish(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 /// RevokeCertificate: revokes a certificate of the application.
-pub(crate) fn revoke(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn revoke(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::NodeId(application), Variant::ByteString(bytes)] = request.arguments.as_slice()
     else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -125,7 +125,7 @@ pub(crate) fn revoke(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 /// GetCertificateGroups: returns the only group.
-pub(crate) fn groups(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn groups(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::NodeId(application)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
     };
@@ -134,7 +134,7 @@ pub(crate) fn groups(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 /// GetTrustList: returns the node of the group's trust list.
-pub(crate) fn trust_list(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn trust_list(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::NodeId(application), Variant::NodeId(group)] = request.arguments.as_slice()
     else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -145,7 +145,7 @@ pub(crate) fn trust_list(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 /// GetCertificates: returns the latest certificate of the application.
-pub(crate) fn certificates(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn certificates(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::NodeId(application), Variant::NodeId(group)] = request.arguments.as_slice()
     else {
         return Err(StatusCode::BadInvalidArgument.into());
@@ -164,7 +164,7 @@ pub(crate) fn certificates(gds: &Gds, request: &MethodRequest) -> Answer {
 }
 
 /// GetCertificateStatus: returns true if the application has to request a new certificate.
-pub(crate) fn status(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn status(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [
         Variant::NodeId(application),
         Variant::NodeId(group),
@@ -186,7 +186,7 @@ pub(crate) fn status(gds: &Gds, request: &MethodRequest) -> Answer {
 
 /// CheckRevocationStatus: returns the revocation status of a certificate, as far as the authority
 /// knows it.
-pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> Answer {
+pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> MethodResult {
     let [Variant::ByteString(bytes)] = request.arguments.as_slice() else {
         return Err(StatusCode::BadInvalidArgument.into());
     };
@@ -214,7 +214,7 @@ pub(crate) fn check(gds: &Gds, request: &MethodRequest) -> Answer {
 impl Gds {
     /// Returns the application for which a caller requests a certificate: a registered application,
     /// or an applicant for its first certificate.
-    fn asking(&self, caller: &Caller, id: &NodeId) -> Result<(Record, Standing), StatusCode> {
+    fn asking(&self, caller: &Caller, id: &NodeId) -> Result<(Record, CallerStanding), StatusCode> {
         self.is_unread(caller)?;
         let known = number(id).and_then(|number| self.records.lock().get(number).cloned());
         let record = match known {
@@ -225,10 +225,10 @@ impl Gds {
             }
         };
         match self.standing(caller, &record.uri)? {
-            Standing::Stranger => Err(StatusCode::BadUserAccessDenied),
-            standing @ (Standing::Administrator | Standing::Itself | Standing::Applicant(_)) => {
-                Ok((record, standing))
-            }
+            CallerStanding::Stranger => Err(StatusCode::BadUserAccessDenied),
+            standing @ (CallerStanding::Administrator
+            | CallerStanding::Itself
+            | CallerStanding::Applicant(_)) => Ok((record, standing)),
         }
     }
 
@@ -239,12 +239,12 @@ impl Gds {
     pub(crate) fn ask(
         &self,
         caller: &Caller,
-        (record, standing): (&Record, Standing),
+        (record, standing): (&Record, CallerStanding),
         wanted: Request,
     ) -> Result<u32, Refusal> {
         match standing {
-            Standing::Applicant(key) => self.apply(record, wanted, key),
-            Standing::Administrator | Standing::Itself | Standing::Stranger => {
+            CallerStanding::Applicant(key) => self.apply(record, wanted, key),
+            CallerStanding::Administrator | CallerStanding::Itself | CallerStanding::Stranger => {
                 let waiting = self.unconfirmed_hosts(caller, record, wanted.hosts())?;
                 if wanted.challenge().is_some() {
                     return Err(unfit(
@@ -279,36 +279,38 @@ impl Gds {
     pub(crate) fn fetch(
         &self,
         caller: &Caller,
-        (record, standing): (&Record, Standing),
+        (record, standing): (&Record, CallerStanding),
         number: u32,
     ) -> Result<Certificate, Refusal> {
-        let requests: Requests =
+        let requests: SigningRequests =
             kept::read(&self.folder.join(requests::FILE)).map_err(|error| unkept(&error))?;
         let asked = requests.get(number, now());
         let asked = asked.filter(|one| one.uri == record.uri);
         let asked = asked.ok_or(StatusCode::BadNotFound)?;
-        if let Standing::Applicant(key) = standing
+        if let CallerStanding::Applicant(key) = standing
             && !asked.is_of_key(key)
         {
             return Err(StatusCode::BadUserAccessDenied.into());
         }
         match (&asked.state, standing) {
-            (State::Issued { .. }, _) => Ok(asked.certificate().ok_or(StatusCode::BadNotFound)?),
-            (State::Approved { by }, _) => self.issue(asked, by),
+            (RequestState::Issued { .. }, _) => {
+                Ok(asked.certificate().ok_or(StatusCode::BadNotFound)?)
+            }
+            (RequestState::Approved { by }, _) => self.issue(asked, by),
             // An administrator approves a request by fetching the certificate.
-            (State::Waiting | State::Refused, Standing::Administrator) => {
+            (RequestState::Waiting | RequestState::Refused, CallerStanding::Administrator) => {
                 self.issue(asked, &caller.user)
             }
             // Trust in an application approves its request, but no further hosts.
-            (State::Waiting, Standing::Itself) => {
+            (RequestState::Waiting, CallerStanding::Itself) => {
                 let wanted = asked.request().ok_or(StatusCode::BadNotFound)?;
                 match self.are_confirmed(caller, &record.uri, wanted.hosts())? {
                     true => self.issue(asked, &caller.user),
                     false => Err(StatusCode::BadRequestNotComplete.into()),
                 }
             }
-            (State::Waiting, _) => Err(StatusCode::BadRequestNotComplete.into()),
-            (State::Refused, _) => Err(StatusCode::BadUserAccessDenied.into()),
+            (RequestState::Waiting, _) => Err(StatusCode::BadRequestNotComplete.into()),
+            (RequestState::Refused, _) => Err(StatusCode::BadUserAccessDenied.into()),
         }
     }
 
@@ -364,7 +366,7 @@ impl Gds {
             self.register_and_issue(Some(record), wanted, &format!("invitation {invitation}"))?;
         let path = self.folder.join(requests::FILE);
         // The token is a secret: the request is not stored.
-        let kept = kept::change(&path, |all: &mut Requests| {
+        let kept = kept::change(&path, |all: &mut SigningRequests| {
             all.put_issued((wanted, &issued), now())
         });
         Ok(kept.map_err(|error| unkept(&error))?)
@@ -376,13 +378,13 @@ impl Gds {
         request: Request,
         (record, approved): (Option<Record>, Option<String>),
     ) -> Result<u32, Refusal> {
-        let wanted = Wanted {
+        let wanted = NewRequest {
             request,
             record,
             approved,
         };
         let path = self.folder.join(requests::FILE);
-        let kept = kept::change(&path, |all: &mut Requests| all.put(wanted, now()));
+        let kept = kept::change(&path, |all: &mut SigningRequests| all.put(wanted, now()));
         kept.map_err(|error| unkept(&error))?.map_err(|full| {
             if let Some(suppressed) = self.another("full") {
                 warn!(suppressed, "refused a certificate request: {full}");
@@ -392,11 +394,11 @@ impl Gds {
     }
 
     /// Issues the certificate of an approved request.
-    fn issue(&self, asked: &Asked, by: &str) -> Result<Certificate, Refusal> {
+    fn issue(&self, asked: &SigningRequest, by: &str) -> Result<Certificate, Refusal> {
         let request = asked.request().ok_or(StatusCode::BadNotFound)?;
         let issued = self.register_and_issue(asked.record.as_ref(), &request, by)?;
         let path = self.folder.join(requests::FILE);
-        let kept = kept::change(&path, |all: &mut Requests| {
+        let kept = kept::change(&path, |all: &mut SigningRequests| {
             all.issued(asked.number, &issued, now());
         });
         kept.map_err(|error| unkept(&error))?;
@@ -460,9 +462,9 @@ impl Gds {
         let uri = &caller.application_uri;
         let registered = self.records.lock().of_uri(uri).next().is_some();
         match self.standing(caller, uri)? {
-            Standing::Administrator => Ok(()),
-            Standing::Itself if registered => Ok(()),
-            Standing::Itself | Standing::Applicant(_) | Standing::Stranger => {
+            CallerStanding::Administrator => Ok(()),
+            CallerStanding::Itself if registered => Ok(()),
+            CallerStanding::Itself | CallerStanding::Applicant(_) | CallerStanding::Stranger => {
                 Err(StatusCode::BadUserAccessDenied)
             }
         }

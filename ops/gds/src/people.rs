@@ -17,7 +17,7 @@ use crate::Folders;
 use crate::ca::{io_fault, open, say};
 use crate::invitations::{self, Invitations, RANDOM};
 use crate::kept;
-use crate::requests::{self, Asked, Requests, State};
+use crate::requests::{self, RequestState, SigningRequest, SigningRequests};
 use crate::serve::ensure_own;
 use crate::service::now;
 
@@ -45,7 +45,7 @@ pub(crate) enum PeopleVerb {
         folders: Folders,
     },
     /// List the certificate requests and the valid invitations
-    Requests {
+    SigningRequests {
         /// Print a JSON line for each
         #[arg(long)]
         json: bool,
@@ -126,7 +126,7 @@ fn invite(
 }
 
 fn list(folders: &Folders, json: bool) -> Result<(), Failure> {
-    let requests: Requests = read(folders, requests::FILE)?;
+    let requests: SigningRequests = read(folders, requests::FILE)?;
     for one in requests.kept(now()) {
         say(&if json { as_json(one) } else { line(one) })?;
     }
@@ -159,7 +159,7 @@ fn list(folders: &Folders, json: bool) -> Result<(), Failure> {
 
 fn approve(folders: &Folders, number: u32) -> Result<(), Failure> {
     let by = "the command line".to_owned();
-    let decided = decide(folders, number, State::Approved { by })?;
+    let decided = decide(folders, number, RequestState::Approved { by })?;
     let Some(one) = decided else {
         return Err(unknown(&number.to_string()));
     };
@@ -168,7 +168,7 @@ fn approve(folders: &Folders, number: u32) -> Result<(), Failure> {
 
 fn reject(folders: &Folders, number: &str) -> Result<(), Failure> {
     if let Ok(request) = number.parse::<u32>()
-        && let Some(one) = decide(folders, request, State::Refused)?
+        && let Some(one) = decide(folders, request, RequestState::Refused)?
     {
         return say(&format!("rejected: {}", line(&one)));
     }
@@ -181,8 +181,12 @@ fn reject(folders: &Folders, number: &str) -> Result<(), Failure> {
     }
 }
 
-fn decide(folders: &Folders, number: u32, state: State) -> Result<Option<Asked>, Failure> {
-    change(folders, requests::FILE, |all: &mut Requests| {
+fn decide(
+    folders: &Folders,
+    number: u32,
+    state: RequestState,
+) -> Result<Option<SigningRequest>, Failure> {
+    change(folders, requests::FILE, |all: &mut SigningRequests| {
         all.decide(number, state, now()).cloned()
     })
 }
@@ -194,7 +198,7 @@ fn unknown(number: &str) -> Failure {
 }
 
 /// Returns a line about a request for the operator. Texts of its owner are escaped.
-fn line(one: &Asked) -> String {
+fn line(one: &SigningRequest) -> String {
     let request = one.request();
     let request = request.as_ref();
     let name = request.map(|request| request.name()).unwrap_or_default();
@@ -209,7 +213,7 @@ fn line(one: &Asked) -> String {
     )
 }
 
-fn as_json(one: &Asked) -> String {
+fn as_json(one: &SigningRequest) -> String {
     let request = one.request();
     let json = serde_json::json!({
         "request": one.number,
@@ -222,12 +226,12 @@ fn as_json(one: &Asked) -> String {
     bridge_node::harmless_json(&json.to_string())
 }
 
-const fn state(one: &Asked) -> &'static str {
+const fn state(one: &SigningRequest) -> &'static str {
     match one.state {
-        State::Waiting => "waits",
-        State::Approved { .. } => "approved",
-        State::Refused => "rejected",
-        State::Issued { .. } => "issued",
+        RequestState::Waiting => "waits",
+        RequestState::Approved { .. } => "approved",
+        RequestState::Refused => "rejected",
+        RequestState::Issued { .. } => "issued",
     }
 }
 

@@ -11,15 +11,15 @@ use crate::records::Record;
 /// All requests, oldest first.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Requests {
+pub(crate) struct SigningRequests {
     last: u32,
-    all: Vec<Asked>,
+    all: Vec<SigningRequest>,
 }
 
 /// A request for a certificate.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Asked {
+pub(crate) struct SigningRequest {
     pub(crate) number: u32,
     /// The ApplicationUri.
     pub(crate) uri: String,
@@ -31,13 +31,13 @@ pub(crate) struct Asked {
     request: String,
     /// Time of the request, of the decision, or of the issue, in seconds since 1970.
     since: u64,
-    pub(crate) state: State,
+    pub(crate) state: RequestState,
 }
 
 /// The state of a request.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum State {
+pub(crate) enum RequestState {
     /// An administrator has not decided.
     Waiting,
     /// The certificate is issued when the client fetches it.
@@ -53,7 +53,7 @@ pub(crate) enum State {
 
 /// A new request.
 #[derive(Debug, Clone)]
-pub(crate) struct Wanted {
+pub(crate) struct NewRequest {
     pub(crate) request: Request,
     pub(crate) record: Option<Record>,
     /// The user or invitation that has approved the request.
@@ -69,17 +69,17 @@ pub(crate) enum Unkept {
     Full,
 }
 
-impl Requests {
+impl SigningRequests {
     /// Stores a request and returns its number. A repeated request of the same key for the same
     /// names keeps its number and its decision.
-    pub(crate) fn put(&mut self, wanted: Wanted, now: Duration) -> Result<u32, Unkept> {
+    pub(crate) fn put(&mut self, wanted: NewRequest, now: Duration) -> Result<u32, Unkept> {
         self.all.retain(|one| one.is_kept(now));
         let request = &wanted.request;
         let key = request.key_fingerprint().to_string();
         let same = self.all.iter_mut().find(|one| {
             let is_open = matches!(
                 one.state,
-                State::Waiting | State::Approved { .. } | State::Refused
+                RequestState::Waiting | RequestState::Approved { .. } | RequestState::Refused
             );
             is_open
                 && one.key == key
@@ -88,7 +88,7 @@ impl Requests {
         });
         if let Some(same) = same {
             if let Some(by) = wanted.approved {
-                same.state = State::Approved { by };
+                same.state = RequestState::Approved { by };
             }
             same.record = wanted.record.or_else(|| same.record.take());
             return Ok(same.number);
@@ -97,12 +97,15 @@ impl Requests {
         if self.all.len() >= MOST {
             // Requests that wait never displace each other; an approved request displaces the
             // oldest that waits.
-            let oldest = self.all.iter().position(|one| one.state == State::Waiting);
+            let oldest = self
+                .all
+                .iter()
+                .position(|one| one.state == RequestState::Waiting);
             let displaced = oldest.filter(|_| is_approved).ok_or(Unkept::Full)?;
             self.all.remove(displaced);
         }
         self.last = self.last.wrapping_add(1);
-        self.all.push(Asked {
+        self.all.push(SigningRequest {
             number: self.last,
             uri: request.application_uri().to_owned(),
             key,
@@ -110,8 +113,8 @@ impl Requests {
             request: hex(request.der()),
             since: now.as_secs(),
             state: match wanted.approved {
-                Some(by) => State::Approved { by },
-                None => State::Waiting,
+                Some(by) => RequestState::Approved { by },
+                None => RequestState::Waiting,
             },
         });
         Ok(self.last)
@@ -126,18 +129,21 @@ impl Requests {
     ) -> u32 {
         self.all.retain(|one| one.is_kept(now));
         if self.all.len() >= MOST {
-            let oldest = self.all.iter().position(|one| one.state == State::Waiting);
+            let oldest = self
+                .all
+                .iter()
+                .position(|one| one.state == RequestState::Waiting);
             self.all.remove(oldest.unwrap_or_default());
         }
         self.last = self.last.wrapping_add(1);
-        self.all.push(Asked {
+        self.all.push(SigningRequest {
             number: self.last,
             uri: request.application_uri().to_owned(),
             key: request.key_fingerprint().to_string(),
             record: None,
             request: String::new(),
             since: now.as_secs(),
-            state: State::Issued {
+            state: RequestState::Issued {
                 certificate: hex(certificate.der()),
             },
         });
@@ -145,21 +151,26 @@ impl Requests {
     }
 
     /// Returns the request with a number.
-    pub(crate) fn get(&self, number: u32, now: Duration) -> Option<&Asked> {
+    pub(crate) fn get(&self, number: u32, now: Duration) -> Option<&SigningRequest> {
         let mut kept = self.kept(now);
         kept.find(|one| one.number == number)
     }
 
     /// Lists the requests that have not expired.
-    pub(crate) fn kept(&self, now: Duration) -> impl Iterator<Item = &Asked> {
+    pub(crate) fn kept(&self, now: Duration) -> impl Iterator<Item = &SigningRequest> {
         self.all.iter().filter(move |one| one.is_kept(now))
     }
 
     /// Approves or refuses a request without an issued certificate, and returns the request.
-    pub(crate) fn decide(&mut self, number: u32, state: State, now: Duration) -> Option<&Asked> {
+    pub(crate) fn decide(
+        &mut self,
+        number: u32,
+        state: RequestState,
+        now: Duration,
+    ) -> Option<&SigningRequest> {
         let mut all = self.all.iter_mut().filter(|one| one.is_kept(now));
         let one = all.find(|one| one.number == number)?;
-        if matches!(one.state, State::Issued { .. }) {
+        if matches!(one.state, RequestState::Issued { .. }) {
             return None;
         }
         one.state = state;
@@ -171,7 +182,7 @@ impl Requests {
     /// Stores the certificate that was issued for a request.
     pub(crate) fn issued(&mut self, number: u32, certificate: &Certificate, now: Duration) {
         if let Some(one) = self.all.iter_mut().find(|one| one.number == number) {
-            one.state = State::Issued {
+            one.state = RequestState::Issued {
                 certificate: hex(certificate.der()),
             };
             one.since = now.as_secs();
@@ -179,7 +190,7 @@ impl Requests {
     }
 }
 
-impl Asked {
+impl SigningRequest {
     /// Reads the request.
     pub(crate) fn request(&self) -> Option<Request> {
         Request::read(&unhex(&self.request)?).ok()
@@ -187,7 +198,7 @@ impl Asked {
 
     /// Reads the issued certificate.
     pub(crate) fn certificate(&self) -> Option<Certificate> {
-        let State::Issued { certificate } = &self.state else {
+        let RequestState::Issued { certificate } = &self.state else {
             return None;
         };
         Certificate::read(&unhex(certificate)?).ok()
@@ -206,9 +217,9 @@ impl Asked {
 
     fn is_kept(&self, now: Duration) -> bool {
         let life = match self.state {
-            State::Waiting | State::Approved { .. } => KEPT_OPEN,
-            State::Refused => KEPT_REFUSED,
-            State::Issued { .. } => KEPT_ISSUED,
+            RequestState::Waiting | RequestState::Approved { .. } => KEPT_OPEN,
+            RequestState::Refused => KEPT_REFUSED,
+            RequestState::Issued { .. } => KEPT_ISSUED,
         };
         now.saturating_sub(Duration::from_secs(self.since)) < life
     }
@@ -242,9 +253,9 @@ mod tests {
 
     const NOW: Duration = Duration::from_secs(1_795_000_000);
 
-    fn wanted(key: &[u8], uri: &str, host: &str, approved: Option<&str>) -> Wanted {
+    fn wanted(key: &[u8], uri: &str, host: &str, approved: Option<&str>) -> NewRequest {
         let hosts = [host.to_owned()];
-        Wanted {
+        NewRequest {
             request: Request::make(key, uri, ("Robot", ""), &hosts).unwrap(),
             record: None,
             approved: approved.map(str::to_owned),
@@ -254,31 +265,35 @@ mod tests {
     #[test]
     fn a_repeated_request_keeps_its_number_and_decision_and_another_host_asks_anew() {
         let key = new_key(2048).unwrap();
-        let mut all = Requests::default();
+        let mut all = SigningRequests::default();
         let first = all.put(wanted(&key, "urn:a", "robot", None), NOW).unwrap();
         let by = "sara".to_owned();
-        all.decide(first, State::Approved { by }, NOW).unwrap();
+        all.decide(first, RequestState::Approved { by }, NOW)
+            .unwrap();
         let again = all.put(wanted(&key, "urn:a", "robot", None), NOW).unwrap();
         assert_eq!(again, first);
         let state = &all.get(first, NOW).unwrap().state;
-        assert!(matches!(state, State::Approved { .. }), "{state:?}");
+        assert!(matches!(state, RequestState::Approved { .. }), "{state:?}");
         let other = all.put(wanted(&key, "urn:a", "other", None), NOW).unwrap();
         assert_ne!(other, first);
-        assert_eq!(all.get(other, NOW).unwrap().state, State::Waiting);
+        assert_eq!(all.get(other, NOW).unwrap().state, RequestState::Waiting);
     }
 
     #[test]
     fn a_request_is_kept_for_a_week_and_its_certificate_for_a_day() {
         let key = new_key(2048).unwrap();
-        let mut all = Requests::default();
+        let mut all = SigningRequests::default();
         let number = all.put(wanted(&key, "urn:a", "robot", None), NOW).unwrap();
         let text = serde_json::to_string(&all).unwrap();
-        let mut all: Requests = serde_json::from_str(&text).unwrap();
+        let mut all: SigningRequests = serde_json::from_str(&text).unwrap();
         let later = NOW + DAY * 6;
         assert_eq!(all.get(number, later).unwrap().uri, "urn:a");
         assert!(all.get(number, NOW + DAY * 7).is_none());
         let by = "sara".to_owned();
-        assert!(all.decide(number, State::Approved { by }, later).is_some());
+        assert!(
+            all.decide(number, RequestState::Approved { by }, later)
+                .is_some()
+        );
         assert!(all.get(number, later + DAY * 6).is_some());
         let life = (NOW, NOW + DAY * 365);
         let issue = trust::Issue {
@@ -290,14 +305,14 @@ mod tests {
         all.issued(number, authority.certificate(), later);
         let kept = all.get(number, later + DAY / 2).unwrap();
         assert_eq!(kept.certificate().as_ref(), Some(authority.certificate()));
-        assert!(all.decide(number, State::Refused, later).is_none());
+        assert!(all.decide(number, RequestState::Refused, later).is_none());
         assert!(all.get(number, later + DAY).is_none());
     }
 
     #[test]
     fn strangers_fill_the_list_and_displace_no_other_request() {
         let key = new_key(2048).unwrap();
-        let mut all = Requests::default();
+        let mut all = SigningRequests::default();
         for number in 0..MOST {
             let uri = format!("urn:{number}");
             all.put(wanted(&key, &uri, "robot", None), NOW).unwrap();

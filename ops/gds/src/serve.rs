@@ -29,14 +29,14 @@ use trust::{Renewal, Request, Step};
 use crate::kept;
 use crate::manager::{self, StartNewKeyPair, TRUST_LIST};
 use crate::records::Records;
-use crate::service::{Answer, Gds, GroupList, now};
-use crate::store::{Store, StoreFault, claim};
+use crate::service::{Gds, GroupList, MethodResult, now};
+use crate::store::{AuthorityStore, AuthorityStoreFault, claim};
 use crate::{directory, service};
 use plant_opcua::directory::{NAMESPACE, Types};
 
 /// The settings of the server.
 #[derive(Debug)]
-pub(crate) struct Settings {
+pub(crate) struct GdsSettings {
     pub(crate) endpoint: EndpointUrl,
     pub(crate) pki: PathBuf,
     pub(crate) authority: PathBuf,
@@ -47,10 +47,10 @@ pub(crate) struct Settings {
 
 /// Runs the server until `stop` is ready.
 pub(crate) async fn serve(
-    settings: Settings,
+    settings: GdsSettings,
     stop: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
-    let store = Store::open(&settings.authority).map_err(|fault| of_store(&fault))?;
+    let store = AuthorityStore::open(&settings.authority).map_err(|fault| of_store(&fault))?;
     let _claimed = claim(&settings.authority).map_err(|fault| of_store(&fault))?;
     let server = Serving::start(&settings, store)?;
     let told = server.tell(&settings)?;
@@ -83,7 +83,7 @@ struct Serving {
 }
 
 impl Serving {
-    fn start(settings: &Settings, store: Store) -> Result<Self, Failure> {
+    fn start(settings: &GdsSettings, store: AuthorityStore) -> Result<Self, Failure> {
         let failed = |kind| move |error: String| Failure::new(kind, error);
         let io = failed(FailureKind::Io);
         // Clients with a certificate of the authority are admitted. The door of the server is
@@ -152,7 +152,7 @@ impl Serving {
 
     /// Renews the server's own certificate, which restarts the program. Warns once a day before the
     /// certificate of the authority expires.
-    fn look_at_certificates(&self, settings: &Settings, warned: &mut Option<Duration>) {
+    fn look_at_certificates(&self, settings: &GdsSettings, warned: &mut Option<Duration>) {
         let now = now();
         let store = self.gds.store.lock();
         match renew_own(&store, &settings.pki, &settings.endpoint, now) {
@@ -239,7 +239,7 @@ impl Serving {
         }
     }
 
-    fn tell(&self, settings: &Settings) -> Result<Option<Announced>, Failure> {
+    fn tell(&self, settings: &GdsSettings) -> Result<Option<Announced>, Failure> {
         if settings.lds.is_none() && settings.interface.is_none() {
             return Ok(None);
         }
@@ -271,7 +271,7 @@ pub(crate) fn own_uri() -> String {
 /// the certificate, so that all programs that trust the authority trust the server. An existing
 /// certificate stays until its renewal.
 pub(crate) fn ensure_own(
-    store: &Store,
+    store: &AuthorityStore,
     pki: &Path,
     endpoint: &EndpointUrl,
     now: Duration,
@@ -295,11 +295,11 @@ pub(crate) fn ensure_own(
 /// which clients may trust by its file, is renewed near its end. Returns true if there is a new
 /// certificate.
 fn renew_own(
-    store: &Store,
+    store: &AuthorityStore,
     pki: &Path,
     endpoint: &EndpointUrl,
     now: Duration,
-) -> Result<bool, StoreFault> {
+) -> Result<bool, AuthorityStoreFault> {
     let Some(certificate) = own::read(pki) else {
         return Ok(false);
     };
@@ -317,12 +317,12 @@ fn renew_own(
 }
 
 fn issue_own(
-    store: &Store,
+    store: &AuthorityStore,
     pki: &Path,
     endpoint: &EndpointUrl,
     now: Duration,
-) -> Result<(), StoreFault> {
-    let key = own_key(pki).map_err(StoreFault::Key)?;
+) -> Result<(), AuthorityStoreFault> {
+    let key = own_key(pki).map_err(AuthorityStoreFault::Key)?;
     let mut hosts = endpoint.hosts();
     for host in ["localhost", "127.0.0.1", "::1"] {
         if !hosts.iter().any(|one| one == host) {
@@ -330,30 +330,30 @@ fn issue_own(
         }
     }
     let request = Request::make(&key, &own_uri(), (NAME, ""), &hosts);
-    let request = request.map_err(StoreFault::Request)?;
+    let request = request.map_err(AuthorityStoreFault::Request)?;
     let issued = store.issue(&request, now, OWN_LIFE)?;
-    own::replace(pki, &issued, &Cause::Authority).map_err(|source| StoreFault::Io {
+    own::replace(pki, &issued, &Cause::Authority).map_err(|source| AuthorityStoreFault::Io {
         path: pki.to_owned(),
         source,
     })
 }
 
 /// Converts a fault of the store into a failure of the program.
-pub(crate) fn of_store(fault: &StoreFault) -> Failure {
+pub(crate) fn of_store(fault: &AuthorityStoreFault) -> Failure {
     let kind = match fault {
-        StoreFault::Io { .. } | StoreFault::Key(_) => FailureKind::Io,
-        StoreFault::Claimed(_) => FailureKind::Unavailable,
-        StoreFault::Missing(_) | StoreFault::Unfit { .. } | StoreFault::Open(_) => {
-            FailureKind::Configuration
-        }
-        StoreFault::Present(_) | StoreFault::Unknown(_) | StoreFault::Request(_) => {
-            FailureKind::Usage
-        }
+        AuthorityStoreFault::Io { .. } | AuthorityStoreFault::Key(_) => FailureKind::Io,
+        AuthorityStoreFault::Claimed(_) => FailureKind::Unavailable,
+        AuthorityStoreFault::Missing(_)
+        | AuthorityStoreFault::Unfit { .. }
+        | AuthorityStoreFault::Open(_) => FailureKind::Configuration,
+        AuthorityStoreFault::Present(_)
+        | AuthorityStoreFault::Unknown(_)
+        | AuthorityStoreFault::Request(_) => FailureKind::Usage,
     };
     Failure::new(kind, fault.to_string())
 }
 
-type CarryOut = fn(&Gds, &MethodRequest) -> Answer;
+type CarryOut = fn(&Gds, &MethodRequest) -> MethodResult;
 
 const NAME: &str = "UA bridge global discovery server";
 /// The Directory object of the NodeSet.
@@ -415,11 +415,11 @@ mod tests {
         drop(fs::remove_dir_all(&folder));
         let (authority, pki) = (folder.join("authority"), folder.join("pki"));
         let life = OWN_LIFE * 10;
-        Store::init(&authority, ("Plant authority", ""), now(), life).unwrap();
+        AuthorityStore::init(&authority, ("Plant authority", ""), now(), life).unwrap();
         let endpoint: EndpointUrl = "opc.tcp://127.0.0.1:4841".parse().unwrap();
         let start = std::sync::Barrier::new(2);
         let made = || {
-            let store = Store::open(&authority).unwrap();
+            let store = AuthorityStore::open(&authority).unwrap();
             start.wait();
             ensure_own(&store, &pki, &endpoint, now()).unwrap();
             own::read(&pki).unwrap()
@@ -429,7 +429,7 @@ mod tests {
         });
         assert_eq!(first, second);
         assert_eq!(first.issuer_name(), "Plant authority");
-        let store = Store::open(&authority).unwrap();
+        let store = AuthorityStore::open(&authority).unwrap();
         let renewed = |later| renew_own(&store, &pki, &endpoint, now() + later).unwrap();
         assert!(!renewed(OWN_LIFE / 5 * 3) && renewed(OWN_LIFE / 5 * 4));
         assert_ne!(own::read(&pki).unwrap(), first);

@@ -21,14 +21,14 @@ use trust::{Certificate, Fingerprint};
 
 use crate::applicants::Applicants;
 use crate::records::{Record, RecordFault, Records};
-use crate::store::{Store, StoreFault};
+use crate::store::{AuthorityStore, AuthorityStoreFault};
 
 /// The result of a method.
-pub(crate) type Answer = Result<Vec<Variant>, Refusal>;
+pub(crate) type MethodResult = Result<Vec<Variant>, Refusal>;
 
 /// The register and the authority.
 pub(crate) struct Gds {
-    pub(crate) store: Mutex<Store>,
+    pub(crate) store: Mutex<AuthorityStore>,
     pub(crate) records: Mutex<Records>,
     /// Applications that wait for their first certificate and are not registered.
     pub(crate) applicants: Mutex<Applicants>,
@@ -60,8 +60,10 @@ impl Gds {
     /// Returns the status for the caller.
     pub(crate) fn may(&self, caller: &Caller, uri: &str) -> Result<(), StatusCode> {
         match self.standing(caller, uri)? {
-            Standing::Administrator | Standing::Itself => Ok(()),
-            Standing::Applicant(_) | Standing::Stranger => Err(StatusCode::BadUserAccessDenied),
+            CallerStanding::Administrator | CallerStanding::Itself => Ok(()),
+            CallerStanding::Applicant(_) | CallerStanding::Stranger => {
+                Err(StatusCode::BadUserAccessDenied)
+            }
         }
     }
 
@@ -69,18 +71,22 @@ impl Gds {
     ///
     /// # Errors
     /// Returns `BadSecurityModeInsufficient` if the channel is not encrypted.
-    pub(crate) fn standing(&self, caller: &Caller, uri: &str) -> Result<Standing, StatusCode> {
+    pub(crate) fn standing(
+        &self,
+        caller: &Caller,
+        uri: &str,
+    ) -> Result<CallerStanding, StatusCode> {
         self.is_unread(caller)?;
         if self.is_administrator(caller) {
-            return Ok(Standing::Administrator);
+            return Ok(CallerStanding::Administrator);
         }
         let Some(certificate) = Self::proof(caller, uri) else {
-            return Ok(Standing::Stranger);
+            return Ok(CallerStanding::Stranger);
         };
         let key = certificate.key_fingerprint();
         match self.is_trusted(&certificate) || self.has_issued(uri, key) {
-            true => Ok(Standing::Itself),
-            false => Ok(Standing::Applicant(key)),
+            true => Ok(CallerStanding::Itself),
+            false => Ok(CallerStanding::Applicant(key)),
         }
     }
 
@@ -145,7 +151,11 @@ impl Gds {
 
     /// Revokes certificates of an application, and updates the revocation list of the server
     /// itself.
-    pub(crate) fn revoke(&self, gone: &[Certificate], now: Duration) -> Result<(), StoreFault> {
+    pub(crate) fn revoke(
+        &self,
+        gone: &[Certificate],
+        now: Duration,
+    ) -> Result<(), AuthorityStoreFault> {
         let store = self.store.lock();
         for one in gone {
             store.revoke(&one.serial(), now)?;
@@ -157,7 +167,7 @@ impl Gds {
 
     /// Copies the current revocation list to the store of the server itself, so that it refuses
     /// revoked certificates.
-    pub(crate) fn know(&self, now: Duration) -> Result<(), StoreFault> {
+    pub(crate) fn know(&self, now: Duration) -> Result<(), AuthorityStoreFault> {
         let list = self.store.lock().current_list(now)?;
         let mut known = self.known.lock();
         if *known == list.der() {
@@ -174,7 +184,7 @@ impl Gds {
 
 /// The standing of a caller for an application.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Standing {
+pub(crate) enum CallerStanding {
     /// A user with the role SecurityAdmin.
     Administrator,
     /// The application, with a trusted certificate or with a key that has a certificate of the
@@ -232,7 +242,7 @@ pub(crate) fn number(id: &NodeId) -> Option<u32> {
 }
 
 /// Logs a fault of the authority and returns the status for the caller.
-pub(crate) fn refused(fault: &StoreFault) -> StatusCode {
+pub(crate) fn refused(fault: &AuthorityStoreFault) -> StatusCode {
     warn!("{fault}");
     match fault.is_io() {
         true => StatusCode::BadResourceUnavailable,

@@ -15,7 +15,7 @@ use crate::records::replace;
 
 /// The authority of a folder.
 #[derive(Debug)]
-pub(crate) struct Store {
+pub(crate) struct AuthorityStore {
     folder: PathBuf,
     authority: Authority,
 }
@@ -30,7 +30,7 @@ pub(crate) struct Issued {
 
 /// The reason why the authority failed.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum StoreFault {
+pub(crate) enum AuthorityStoreFault {
     #[error("{path}: {source}")]
     Io {
         path: PathBuf,
@@ -59,25 +59,25 @@ pub(crate) enum StoreFault {
     Request(Unfit),
 }
 
-impl StoreFault {
+impl AuthorityStoreFault {
     /// Returns true for an I/O fault, and false for a fault of the request or the authority.
     pub(crate) const fn is_io(&self) -> bool {
         matches!(self, Self::Io { .. })
     }
 }
 
-impl Store {
+impl AuthorityStore {
     /// Creates an authority with this life.
     pub(crate) fn init(
         folder: &Path,
         names: (&str, &str),
         now: Duration,
         life: Duration,
-    ) -> Result<Self, StoreFault> {
+    ) -> Result<Self, AuthorityStoreFault> {
         make_folder(folder).map_err(io_at(folder))?;
         let _alone = lock(folder)?;
         if folder.join(CERTIFICATE).exists() {
-            return Err(StoreFault::Present(folder.to_owned()));
+            return Err(AuthorityStoreFault::Present(folder.to_owned()));
         }
         // A key without a certificate remains from an interrupted start, and has signed nothing.
         let path = folder.join(KEY);
@@ -95,7 +95,8 @@ impl Store {
             from: now.saturating_sub(CLOCKS_DIFFER),
             until: now + life,
         };
-        let authority = Authority::make(&key, names, &issue).map_err(StoreFault::Request)?;
+        let authority =
+            Authority::make(&key, names, &issue).map_err(AuthorityStoreFault::Request)?;
         if is_new {
             write_key(&path, &pem_of(&key)?).map_err(io_at(&path))?;
         }
@@ -111,17 +112,17 @@ impl Store {
     }
 
     /// Opens the authority of a folder.
-    pub(crate) fn open(folder: &Path) -> Result<Self, StoreFault> {
+    pub(crate) fn open(folder: &Path) -> Result<Self, AuthorityStoreFault> {
         let (path, key) = (folder.join(CERTIFICATE), folder.join(KEY));
         if !path.exists() || !key.exists() {
-            return Err(StoreFault::Missing(folder.to_owned()));
+            return Err(AuthorityStoreFault::Missing(folder.to_owned()));
         }
         if !is_owners(&key).map_err(io_at(&key))? {
-            return Err(StoreFault::Open(key));
+            return Err(AuthorityStoreFault::Open(key));
         }
         let unfit = |path: &Path| {
             let path = path.to_owned();
-            move |why| StoreFault::Unfit { path, why }
+            move |why| AuthorityStoreFault::Unfit { path, why }
         };
         let bytes = fs::read(&path).map_err(io_at(&path))?;
         let certificate = Certificate::read(&bytes).map_err(unfit(&path))?;
@@ -148,7 +149,7 @@ impl Store {
         request: &Request,
         now: Duration,
         life: Duration,
-    ) -> Result<Certificate, StoreFault> {
+    ) -> Result<Certificate, AuthorityStoreFault> {
         let _alone = lock(&self.folder)?;
         let issue = Issue {
             serial: random_serial(),
@@ -156,7 +157,7 @@ impl Store {
             until: now + life,
         };
         let made = self.authority.issue(request, &issue);
-        let made = made.map_err(StoreFault::Request)?;
+        let made = made.map_err(AuthorityStoreFault::Request)?;
         let folder = self.folder.join(ISSUED);
         fs::create_dir_all(&folder).map_err(io_at(&folder))?;
         let path = folder.join(format!("{}.der", made.serial()));
@@ -166,11 +167,11 @@ impl Store {
     }
 
     /// Revokes a certificate that was issued here. Repeating it has no effect.
-    pub(crate) fn revoke(&self, serial: &Serial, now: Duration) -> Result<(), StoreFault> {
+    pub(crate) fn revoke(&self, serial: &Serial, now: Duration) -> Result<(), AuthorityStoreFault> {
         let _alone = lock(&self.folder)?;
         let name = format!("{serial}.der");
         if !self.folder.join(ISSUED).join(name).exists() {
-            return Err(StoreFault::Unknown(serial.to_string()));
+            return Err(AuthorityStoreFault::Unknown(serial.to_string()));
         }
         let mut all = self.revoked()?;
         if !all.iter().any(|one| one.serial == *serial) {
@@ -185,14 +186,14 @@ impl Store {
     }
 
     /// Returns all issued certificates, sorted by name.
-    pub(crate) fn list(&self) -> Result<Vec<Issued>, StoreFault> {
+    pub(crate) fn list(&self) -> Result<Vec<Issued>, AuthorityStoreFault> {
         let revoked = self.revoked()?;
         let folder = self.folder.join(ISSUED);
         let entries = match fs::read_dir(&folder) {
             Ok(entries) => entries,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             Err(source) => {
-                return Err(StoreFault::Io {
+                return Err(AuthorityStoreFault::Io {
                     path: folder,
                     source,
                 });
@@ -222,7 +223,10 @@ impl Store {
     }
 
     /// Returns the certificates of an application that are not revoked, latest first.
-    pub(crate) fn of_application(&self, uri: &str) -> Result<Vec<Certificate>, StoreFault> {
+    pub(crate) fn of_application(
+        &self,
+        uri: &str,
+    ) -> Result<Vec<Certificate>, AuthorityStoreFault> {
         let all = self.list()?.into_iter();
         let mut own: Vec<Certificate> = all
             .filter(|one| one.revoked.is_none())
@@ -234,7 +238,7 @@ impl Store {
     }
 
     /// Returns the revocation list. It is signed again after half of its life.
-    pub(crate) fn current_list(&self, now: Duration) -> Result<Crl, StoreFault> {
+    pub(crate) fn current_list(&self, now: Duration) -> Result<Crl, AuthorityStoreFault> {
         let path = self.folder.join(LIST);
         let read = || Crl::read(&fs::read(&path).ok()?).ok();
         let current = read().filter(|list| {
@@ -248,7 +252,7 @@ impl Store {
         }
         let _alone = lock(&self.folder)?;
         self.sign_list(now)?;
-        read().ok_or_else(|| StoreFault::Unfit {
+        read().ok_or_else(|| AuthorityStoreFault::Unfit {
             path: path.clone(),
             why: Unfit::Unreadable,
         })
@@ -264,22 +268,22 @@ impl Store {
         self.folder.join(CERTIFICATE)
     }
 
-    fn sign_list(&self, now: Duration) -> Result<(), StoreFault> {
+    fn sign_list(&self, now: Duration) -> Result<(), AuthorityStoreFault> {
         let revoked = self.revoked()?;
         // The number increases with time.
         let number = u64::try_from(now.as_millis()).unwrap_or(u64::MAX);
         let list = self.authority.crl(&revoked, number, (now, now + LIST_LIFE));
-        let list = list.map_err(StoreFault::Request)?;
+        let list = list.map_err(AuthorityStoreFault::Request)?;
         let path = self.list_path();
         replace(&path, list.der()).map_err(io_at(&path))
     }
 
-    fn revoked(&self) -> Result<Vec<Revoked>, StoreFault> {
+    fn revoked(&self) -> Result<Vec<Revoked>, AuthorityStoreFault> {
         let path = self.folder.join(REVOKED);
         let text = match fs::read_to_string(&path) {
             Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            Err(source) => return Err(StoreFault::Io { path, source }),
+            Err(source) => return Err(AuthorityStoreFault::Io { path, source }),
         };
         let line = |line: &str| {
             let (serial, since) = line.split_once(' ')?;
@@ -290,7 +294,7 @@ impl Store {
         };
         // A revocation that is skipped would make its certificate valid again.
         let all: Option<Vec<Revoked>> = text.lines().map(line).collect();
-        all.ok_or(StoreFault::Unfit {
+        all.ok_or(AuthorityStoreFault::Unfit {
             path,
             why: Unfit::Unreadable,
         })
@@ -298,23 +302,23 @@ impl Store {
 }
 
 /// Creates a private key in the DER of PKCS #8. Takes some time.
-pub(crate) fn new_key(bits: u32) -> Result<Vec<u8>, StoreFault> {
-    let failed = |error: &dyn fmt::Display| StoreFault::Key(error.to_string());
+pub(crate) fn new_key(bits: u32) -> Result<Vec<u8>, AuthorityStoreFault> {
+    let failed = |error: &dyn fmt::Display| AuthorityStoreFault::Key(error.to_string());
     let key = PrivateKey::new(bits).map_err(|error| failed(&error))?;
     let der = key.to_der().map_err(|error| failed(&error))?;
     Ok(der.as_bytes().to_vec())
 }
 
 /// Encodes a private key in PEM.
-pub(crate) fn pem_of(key: &[u8]) -> Result<String, StoreFault> {
+pub(crate) fn pem_of(key: &[u8]) -> Result<String, AuthorityStoreFault> {
     pem::encode_string("PRIVATE KEY", LineEnding::LF, key)
-        .map_err(|error| StoreFault::Key(error.to_string()))
+        .map_err(|error| AuthorityStoreFault::Key(error.to_string()))
 }
 
 /// Reads a key in the DER of PKCS #8.
-fn read_key(path: &Path) -> Result<Vec<u8>, StoreFault> {
+fn read_key(path: &Path) -> Result<Vec<u8>, AuthorityStoreFault> {
     let bytes = fs::read(path).map_err(io_at(path))?;
-    let (_, der) = pem::decode_vec(&bytes).map_err(|_| StoreFault::Unfit {
+    let (_, der) = pem::decode_vec(&bytes).map_err(|_| AuthorityStoreFault::Unfit {
         path: path.to_owned(),
         why: Unfit::Unreadable,
     })?;
@@ -357,15 +361,15 @@ pub(crate) fn write_key(path: &Path, pem: &str) -> io::Result<()> {
 ///
 /// # Errors
 /// Returns an error if another server has locked the folder.
-pub(crate) fn claim(folder: &Path) -> Result<File, StoreFault> {
+pub(crate) fn claim(folder: &Path) -> Result<File, AuthorityStoreFault> {
     let path = folder.join("running");
     let file = File::create(&path).map_err(io_at(&path))?;
     match file.try_lock() {
         Ok(()) => Ok(file),
-        Err(TryLockError::WouldBlock) => Err(StoreFault::Claimed(folder.to_owned())),
+        Err(TryLockError::WouldBlock) => Err(AuthorityStoreFault::Claimed(folder.to_owned())),
         // Some network file systems have no locks.
         Err(TryLockError::Error(error)) if error.kind() == io::ErrorKind::Unsupported => Ok(file),
-        Err(TryLockError::Error(source)) => Err(StoreFault::Io { path, source }),
+        Err(TryLockError::Error(source)) => Err(AuthorityStoreFault::Io { path, source }),
     }
 }
 
@@ -374,14 +378,14 @@ fn random_serial() -> Serial {
     Serial::random(bytes.try_into().unwrap_or([0; 16]))
 }
 
-fn io_at(path: &Path) -> impl FnOnce(io::Error) -> StoreFault + use<> {
+fn io_at(path: &Path) -> impl FnOnce(io::Error) -> AuthorityStoreFault + use<> {
     let path = path.to_owned();
-    move |source| StoreFault::Io { path, source }
+    move |source| AuthorityStoreFault::Io { path, source }
 }
 
 /// Waits until no other process issues or revokes here, and locks the folder until the file is
 /// dropped.
-fn lock(folder: &Path) -> Result<File, StoreFault> {
+fn lock(folder: &Path) -> Result<File, AuthorityStoreFault> {
     let path = folder.join("lock");
     let locked = File::create(&path).and_then(|file| match file.lock() {
         // Some network file systems have no locks.
@@ -443,10 +447,10 @@ mod tests {
     #[test]
     fn what_was_issued_and_revoked_is_known_after_a_restart() {
         let folder = scratch("authority");
-        Store::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
-        let again = Store::init(&folder, ("Plant authority", "Plant"), NOW, YEAR);
-        assert!(matches!(again, Err(StoreFault::Present(_))));
-        let store = Store::open(&folder).unwrap();
+        AuthorityStore::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
+        let again = AuthorityStore::init(&folder, ("Plant authority", "Plant"), NOW, YEAR);
+        assert!(matches!(again, Err(AuthorityStoreFault::Present(_))));
+        let store = AuthorityStore::open(&folder).unwrap();
         let key = new_key(2048).unwrap();
         let hosts = ["robot".to_owned()];
         let request = Request::make(&key, "urn:robot", ("Robot", "Plant"), &hosts).unwrap();
@@ -456,7 +460,7 @@ mod tests {
                 .unwrap()
         });
         store.revoke(&first.serial(), NOW).unwrap();
-        let store = Store::open(&folder).unwrap();
+        let store = AuthorityStore::open(&folder).unwrap();
         assert_eq!(store.of_application("urn:robot").unwrap(), [second]);
         let list = store.current_list(NOW).unwrap();
         assert!(list.is_of(store.certificate()) && list.revokes(&first));
@@ -468,7 +472,7 @@ mod tests {
                 .is_current(NOW + LIST_LIFE)
         );
         let unknown = store.revoke(&Serial::of(&[1, 2, 3]), NOW);
-        assert!(matches!(unknown, Err(StoreFault::Unknown(_))));
+        assert!(matches!(unknown, Err(AuthorityStoreFault::Unknown(_))));
         fs::remove_dir_all(folder).unwrap();
     }
 
@@ -482,9 +486,9 @@ mod tests {
             write_key(&folder.join(KEY), "other").is_err(),
             "it is never replaced"
         );
-        Store::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
+        AuthorityStore::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
         assert_eq!(read_key(&folder.join(KEY)).unwrap(), key);
-        Store::open(&folder).unwrap();
+        AuthorityStore::open(&folder).unwrap();
         fs::remove_dir_all(folder).unwrap();
     }
 
@@ -493,7 +497,10 @@ mod tests {
         let folder = scratch("claimed");
         fs::create_dir_all(&folder).unwrap();
         let first = claim(&folder).unwrap();
-        assert!(matches!(claim(&folder), Err(StoreFault::Claimed(_))));
+        assert!(matches!(
+            claim(&folder),
+            Err(AuthorityStoreFault::Claimed(_))
+        ));
         drop(first);
         claim(&folder).unwrap();
         fs::remove_dir_all(folder).unwrap();
@@ -504,10 +511,13 @@ mod tests {
     fn a_key_that_others_can_read_is_refused() {
         use std::os::unix::fs::PermissionsExt as _;
         let folder = scratch("open");
-        Store::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
+        AuthorityStore::init(&folder, ("Plant authority", "Plant"), NOW, YEAR).unwrap();
         let open = fs::Permissions::from_mode(0o644);
         fs::set_permissions(folder.join(KEY), open).unwrap();
-        assert!(matches!(Store::open(&folder), Err(StoreFault::Open(_))));
+        assert!(matches!(
+            AuthorityStore::open(&folder),
+            Err(AuthorityStoreFault::Open(_))
+        ));
         fs::remove_dir_all(folder).unwrap();
     }
 }

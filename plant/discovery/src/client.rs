@@ -28,8 +28,8 @@ use tokio::time::timeout;
 use plant_opcua::supervision::Registrar;
 
 use crate::announce::Server;
-use crate::security::Security;
-use crate::wire::{Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
+use crate::security::ChannelSecurity;
+use crate::wire::{Conversation, FrameKind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
 use mdns::Url;
 
 /// An error of a query.
@@ -287,7 +287,7 @@ async fn read_in_session(
 /// A secured channel to a server, and the identity of the server.
 #[derive(Debug)]
 struct Way {
-    security: Security,
+    security: ChannelSecurity,
     server: ByteString,
     mode: MessageSecurityMode,
     /// The ApplicationUri of the server, which its certificate contains.
@@ -298,7 +298,7 @@ struct Way {
 /// Returns `None` if the server offers no secured channel. Also returns `None` for an untrusted
 /// server on this host: an attacker on this host has the same power without a forged server.
 async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
-    let security = Security::existing(pki).map_err(AskFault::Certificate)?;
+    let security = ChannelSecurity::existing(pki).map_err(AskFault::Certificate)?;
     let request = GetEndpointsRequest {
         request_header: header(),
         endpoint_url: url.into(),
@@ -460,7 +460,7 @@ async fn opened(url: &str, way: Option<&Way>) -> Result<Conversation<TcpStream>,
     conversation
         .greet(&HelloMessage::new(url, chunk, chunk, message, chunks))
         .await?;
-    let acknowledge: AcknowledgeMessage = conversation.greeting(Kind::Acknowledge).await?;
+    let acknowledge: AcknowledgeMessage = conversation.greeting(FrameKind::Acknowledge).await?;
     conversation.limit(
         acknowledge.receive_buffer_size,
         acknowledge.max_message_size,

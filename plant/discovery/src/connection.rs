@@ -25,23 +25,24 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 use tracing::debug;
 
-use crate::security::{Security, application_uri};
-use crate::services::{self, Answer, Own, Question};
+use crate::security::{ChannelSecurity, application_uri};
+use crate::services::{self, OwnDescription, RegistryAnswer, RegistryQuery};
 use crate::wire::{
-    Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, Received, WireFault, policy,
+    Conversation, FrameKind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, ReceivedMessage, WireFault,
+    policy,
 };
 
 /// A request to the owner of the registry, its channel, and the sender for the response.
-pub(crate) type Asking = (Question, Channel, oneshot::Sender<Answer>);
+pub(crate) type RegistryRequest = (RegistryQuery, Channel, oneshot::Sender<RegistryAnswer>);
 
 /// The state that all connections share.
 #[derive(Debug)]
-pub(crate) struct Shared {
-    pub(crate) own: Own,
+pub(crate) struct ServerShared {
+    pub(crate) own: OwnDescription,
     /// The certificate and key of the server; `None` without secured channels.
-    pub(crate) security: Option<Security>,
-    pub(crate) ask: mpsc::Sender<Asking>,
-    pub(crate) counters: Counters,
+    pub(crate) security: Option<ChannelSecurity>,
+    pub(crate) ask: mpsc::Sender<RegistryRequest>,
+    pub(crate) counters: RequestCounters,
     /// Whether clients on this host may register over an unsecured channel.
     host_may: bool,
     last_channel: AtomicU32,
@@ -49,7 +50,7 @@ pub(crate) struct Shared {
 
 /// Counters of requests and faults.
 #[derive(Debug, Default)]
-pub(crate) struct Counters {
+pub(crate) struct RequestCounters {
     pub(crate) connections: AtomicU64,
     pub(crate) refused_connections: AtomicU64,
     pub(crate) refused_certificates: AtomicU64,
@@ -63,13 +64,17 @@ pub(crate) fn count(counter: &AtomicU64) {
     counter.fetch_add(1, Ordering::Relaxed);
 }
 
-impl Shared {
-    pub(crate) fn new(own: Own, security: Option<Security>, ask: mpsc::Sender<Asking>) -> Self {
+impl ServerShared {
+    pub(crate) fn new(
+        own: OwnDescription,
+        security: Option<ChannelSecurity>,
+        ask: mpsc::Sender<RegistryRequest>,
+    ) -> Self {
         Self {
             own,
             security,
             ask,
-            counters: Counters::default(),
+            counters: RequestCounters::default(),
             host_may: true,
             last_channel: AtomicU32::new(0),
         }
@@ -88,19 +93,19 @@ impl Shared {
         self.last_channel.fetch_add(1, Ordering::Relaxed) % (u32::MAX - 1) + 1
     }
 
-    async fn answer(&self, question: Question, channel: Channel) -> Answer {
+    async fn answer(&self, question: RegistryQuery, channel: Channel) -> RegistryAnswer {
         let (reply, answer) = oneshot::channel();
         let asked = self.ask.send((question, channel, reply)).await;
         let answer = answer.await;
         match (asked, answer) {
             (Ok(()), Ok(answer)) => answer,
-            _ => Answer::Refused(StatusCode::BadShutdown.bits()),
+            _ => RegistryAnswer::Refused(StatusCode::BadShutdown.bits()),
         }
     }
 }
 
 /// Serves a client until it disconnects, times out, or violates the protocol.
-pub(crate) async fn serve<S>(stream: S, peer: SocketAddr, shared: &Shared)
+pub(crate) async fn serve<S>(stream: S, peer: SocketAddr, shared: &ServerShared)
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
@@ -140,7 +145,7 @@ where
 struct Connection<'a, S> {
     conversation: Conversation<S>,
     peer: SocketAddr,
-    shared: &'a Shared,
+    shared: &'a ServerShared,
     /// The timeout without a message.
     lifetime: Duration,
     url: String,
@@ -148,7 +153,7 @@ struct Connection<'a, S> {
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
     async fn run(&mut self) -> Result<(), WireFault> {
-        let hello = self.conversation.greeting::<HelloMessage>(Kind::Hello);
+        let hello = self.conversation.greeting::<HelloMessage>(FrameKind::Hello);
         let hello = timeout(HELLO_LIMIT, hello).await.map_err(|_| LATE)??;
         self.acknowledge(&hello).await?;
         loop {
@@ -160,11 +165,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
                 return Err(LATE);
             };
             let (response, request_id) = match received {
-                Ok(Received {
+                Ok(ReceivedMessage {
                     message: RequestMessage::CloseSecureChannel(_),
                     ..
                 }) => return Ok(()),
-                Ok(Received {
+                Ok(ReceivedMessage {
                     message,
                     request_id,
                     opening,
@@ -260,12 +265,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
 
     /// Checks that the certificate of a registering client is still trusted: it may have been
     /// revoked after the channel was opened.
-    fn stays(&self, question: &Question) -> Result<(), StatusCode> {
+    fn stays(&self, question: &RegistryQuery) -> Result<(), StatusCode> {
         let channel = &self.conversation.channel;
         let is_secured = channel.security_mode() != MessageSecurityMode::None;
         let certificate = channel.remote_cert().filter(|_| is_secured);
         match (certificate, question, &self.shared.security) {
-            (Some(certificate), Question::Register { .. }, Some(security)) => {
+            (Some(certificate), RegistryQuery::Register { .. }, Some(security)) => {
                 security.admit(certificate.as_byte_string().as_ref())
             }
             _ => Ok(()),
@@ -273,12 +278,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
     }
 
     /// Returns the properties of the channel of a request.
-    fn channel(&self, question: &Question) -> Channel {
+    fn channel(&self, question: &RegistryQuery) -> Channel {
         let channel = &self.conversation.channel;
         let is_secured = channel.security_mode() != MessageSecurityMode::None;
         let certificate = channel.remote_cert().filter(|_| is_secured);
         let certificate_uri = match (certificate, question) {
-            (Some(certificate), Question::Register { .. }) => {
+            (Some(certificate), RegistryQuery::Register { .. }) => {
                 let uri = application_uri(certificate.as_byte_string().as_ref());
                 // A certificate without ApplicationUri matches no server.
                 Some(uri.unwrap_or_default())
@@ -294,8 +299,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         }
     }
 
-    fn own(&self) -> Own {
-        Own {
+    fn own(&self) -> OwnDescription {
+        OwnDescription {
             url: self.url.clone(),
             ..self.shared.own.clone()
         }
@@ -378,7 +383,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
 
 /// Checks the security policy and the certificate of a client. Without an own certificate only
 /// policy None is admitted.
-fn admit(header: &AsymmetricSecurityHeader, shared: &Shared) -> Result<(), StatusCode> {
+fn admit(header: &AsymmetricSecurityHeader, shared: &ServerShared) -> Result<(), StatusCode> {
     match (policy(header), &shared.security) {
         (Some(SecurityPolicy::None), _) => Ok(()),
         (Some(_), Some(security)) => {
@@ -416,24 +421,24 @@ mod tests {
         SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 9);
 
     /// Creates a discovery server without registrations.
-    fn shared() -> Arc<Shared> {
-        let (ask, mut questions) = mpsc::channel::<Asking>(4);
+    fn shared() -> Arc<ServerShared> {
+        let (ask, mut questions) = mpsc::channel::<RegistryRequest>(4);
         tokio::spawn(async move {
             while let Some((_, _, reply)) = questions.recv().await {
-                drop(reply.send(Answer::Servers(Vec::new())));
+                drop(reply.send(RegistryAnswer::Servers(Vec::new())));
             }
         });
-        let own = Own {
+        let own = OwnDescription {
             application_uri: "urn:lds".to_owned(),
             name: "lds".to_owned(),
             url: "opc.tcp://h:4840".to_owned(),
             application_type: opcua::types::ApplicationType::DiscoveryServer,
             certificate: ByteString::null(),
         };
-        Arc::new(Shared::new(own, None, ask))
+        Arc::new(ServerShared::new(own, None, ask))
     }
 
-    fn connect(shared: &Arc<Shared>) -> DuplexStream {
+    fn connect(shared: &Arc<ServerShared>) -> DuplexStream {
         let (here, there) = duplex(1 << 20);
         let shared = Arc::clone(shared);
         tokio::spawn(async move { serve(there, PEER, &shared).await });
@@ -445,14 +450,14 @@ mod tests {
     }
 
     /// Creates a client with an open channel.
-    async fn opened(shared: &Arc<Shared>) -> Conversation<DuplexStream> {
+    async fn opened(shared: &Arc<ServerShared>) -> Conversation<DuplexStream> {
         let mut client = Conversation::new(connect(shared), Role::Client);
         client
             .greet(&HelloMessage::new("opc.tcp://h:4840", 65_536, 65_536, 0, 0))
             .await
             .unwrap();
         client
-            .greeting::<AcknowledgeMessage>(Kind::Acknowledge)
+            .greeting::<AcknowledgeMessage>(FrameKind::Acknowledge)
             .await
             .unwrap();
         open(&mut client, SecurityTokenRequestType::Issue).await;
@@ -531,7 +536,7 @@ mod tests {
     }
 
     /// Returns the status of the last Error message to a client that sends these bytes.
-    async fn told(shared: &Arc<Shared>, bytes: &[u8]) -> Option<StatusCode> {
+    async fn told(shared: &Arc<ServerShared>, bytes: &[u8]) -> Option<StatusCode> {
         let mut client = connect(shared);
         client.write_all(bytes).await.unwrap();
         client.shutdown().await.unwrap();

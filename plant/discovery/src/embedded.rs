@@ -16,10 +16,10 @@ use tracing::{debug, info};
 
 use crate::announce::Server;
 use crate::client::AskFault;
-use crate::connection::Asking;
+use crate::connection::RegistryRequest;
 use crate::lds::{EmbeddedIn, Lds, LdsSettings, listen};
-use crate::line::{Line, Reached};
-use crate::services::{Answer, Question};
+use crate::line::{OpenChannel, Reached};
+use crate::services::{RegistryAnswer, RegistryQuery};
 use mdns::Interface;
 use mdns::Url;
 
@@ -95,7 +95,7 @@ impl Embedding {
 /// waiting.
 #[derive(Debug)]
 pub(crate) struct Embedded {
-    ask: mpsc::Sender<Asking>,
+    ask: mpsc::Sender<RegistryRequest>,
     /// Dropping the sender stops the discovery server.
     stop: oneshot::Sender<()>,
     task: JoinHandle<()>,
@@ -103,7 +103,7 @@ pub(crate) struct Embedded {
 
 /// Sends requests of the program to its embedded discovery server.
 #[derive(Debug, Clone)]
-pub(crate) struct EmbeddedAsking(mpsc::Sender<Asking>);
+pub(crate) struct EmbeddedAsking(mpsc::Sender<RegistryRequest>);
 
 impl Embedded {
     pub(crate) fn asking(&self) -> EmbeddedAsking {
@@ -158,7 +158,7 @@ impl EmbeddedAsking {
         async move {
             let asking = async {
                 let (reply, answer) = oneshot::channel();
-                let question = Question::Register {
+                let question = RegistryQuery::Register {
                     asked: Box::new(asked),
                     semaphore_is_there: None,
                 };
@@ -167,11 +167,11 @@ impl EmbeddedAsking {
             };
             match timeout(ANSWER_LIMIT, asking).await {
                 Err(_) => Err(AskFault::Late(ANSWER_LIMIT)),
-                Ok(Some(Answer::Registered)) => Ok(()),
-                Ok(Some(Answer::Refused(status))) => {
+                Ok(Some(RegistryAnswer::Registered)) => Ok(()),
+                Ok(Some(RegistryAnswer::Refused(status))) => {
                     Err(AskFault::Refused(StatusCode::from(status)))
                 }
-                Ok(None | Some(Answer::Servers(_) | Answer::OnNetwork { .. })) => {
+                Ok(None | Some(RegistryAnswer::Servers(_) | RegistryAnswer::OnNetwork { .. })) => {
                     Err(AskFault::Embed("it has ended".to_owned()))
                 }
             }
@@ -187,7 +187,7 @@ pub(crate) async fn lost(lds: String, from: Instant) {
         return;
     };
     loop {
-        match Line::reach(&lds, &place, true, LIMIT).await {
+        match OpenChannel::reach(&lds, &place, true, LIMIT).await {
             Reached::Line(mut line) => {
                 line.broken().await;
                 // A program that ends closes its sockets one after another; its listener may be

@@ -9,10 +9,10 @@ use tokio::net::TcpListener;
 use tokio::task::AbortHandle;
 use tracing::debug;
 
-use crate::connection::{Shared, count, serve};
+use crate::connection::{ServerShared, count, serve};
 
 /// Accepts clients until the future is dropped.
-pub(crate) async fn accept(listener: TcpListener, shared: Arc<Shared>) {
+pub(crate) async fn accept(listener: TcpListener, shared: Arc<ServerShared>) {
     let mut crowd = Crowd::default();
     loop {
         let (stream, peer) = match listener.accept().await {

@@ -9,8 +9,8 @@ use opcua::types::{ApplicationType, ByteString};
 use registry::{Announcement, Registry, Settings};
 use tokio::sync::mpsc;
 
-use crate::connection::{Asking, Shared, serve};
-use crate::services::{Answer, Own, Question};
+use crate::connection::{RegistryRequest, ServerShared, serve};
+use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery};
 use mdns::Url;
 
 use crate::clock;
@@ -19,14 +19,14 @@ use mdns::Subnets;
 /// Returns the response of a discovery server without registrations to a client that sends these
 /// bytes, and the number of registrations afterwards. Requires a tokio runtime.
 pub async fn answered(said: &[u8]) -> (Vec<u8>, usize) {
-    let own = Own {
+    let own = OwnDescription {
         application_uri: "urn:lds".to_owned(),
         name: "lds".to_owned(),
         url: "opc.tcp://127.0.0.1:4840".to_owned(),
         application_type: ApplicationType::DiscoveryServer,
         certificate: ByteString::null(),
     };
-    let (ask, mut questions) = mpsc::channel::<Asking>(1);
+    let (ask, mut questions) = mpsc::channel::<RegistryRequest>(1);
     let answers = tokio::spawn(async move {
         let mut registry = Registry::new(Settings::default());
         let at = clock::now();
@@ -37,7 +37,7 @@ pub async fn answered(said: &[u8]) -> (Vec<u8>, usize) {
         }
         registry.find_servers(&[]).count()
     });
-    let shared = Arc::new(Shared::new(own, None, ask));
+    let shared = Arc::new(ServerShared::new(own, None, ask));
     let mut heard = Vec::new();
     let peer = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 9);
     serve(tokio::io::join(said, &mut heard), peer, &shared).await;
@@ -47,34 +47,34 @@ pub async fn answered(said: &[u8]) -> (Vec<u8>, usize) {
 
 fn answer(
     registry: &mut Registry,
-    question: Question,
+    question: RegistryQuery,
     channel: &registry::Channel,
     at: Instant,
-) -> Answer {
+) -> RegistryAnswer {
     match question {
-        Question::FindServers { uris } => {
+        RegistryQuery::FindServers { uris } => {
             let uris: Vec<&str> = uris.iter().map(String::as_str).collect();
             let found = registry.find_servers(&uris);
-            Answer::Servers(found.map(|(asked, _)| asked.clone()).collect())
+            RegistryAnswer::Servers(found.map(|(asked, _)| asked.clone()).collect())
         }
-        Question::FindOnNetwork {
+        RegistryQuery::FindOnNetwork {
             from,
             most,
             capabilities,
         } => {
             let capabilities: Vec<&str> = capabilities.iter().map(String::as_str).collect();
             let records = registry.find_servers_on_network(from, most, &capabilities);
-            Answer::OnNetwork {
+            RegistryAnswer::OnNetwork {
                 records: records.into_iter().cloned().collect(),
                 reset: clock::wall(),
             }
         }
-        Question::Register {
+        RegistryQuery::Register {
             asked,
             semaphore_is_there,
         } => match registry.register(*asked, channel, semaphore_is_there, at) {
-            Ok(_) => Answer::Registered,
-            Err(fault) => Answer::Refused(fault.status()),
+            Ok(_) => RegistryAnswer::Registered,
+            Err(fault) => RegistryAnswer::Refused(fault.status()),
         },
     }
 }

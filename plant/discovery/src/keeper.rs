@@ -11,7 +11,7 @@ use tokio::time::sleep_until;
 use tracing::info;
 
 use crate::clock::now;
-use crate::liveness::{Liveness, Told, Try};
+use crate::liveness::{EndpointReport, Liveness, Try};
 use mdns::{Aside, Heard, Mdns, Ours, same_place};
 
 /// See the module documentation. Call [`step`](Self::step) repeatedly, and take all
@@ -53,7 +53,7 @@ struct Started {
 /// The event that ended a step.
 enum Happened {
     Heard(Heard),
-    Told(Told),
+    Told(EndpointReport),
     Due,
 }
 
@@ -112,8 +112,8 @@ impl Keeper {
         self.notice_standstill();
         match happened {
             Happened::Heard(heard) => self.hear(heard),
-            Happened::Told(Told::Tried { url, outcome }) => self.probed(&url, outcome),
-            Happened::Told(Told::Broken { url }) => self.registry.suspect(&url),
+            Happened::Told(EndpointReport::Tried { url, outcome }) => self.probed(&url, outcome),
+            Happened::Told(EndpointReport::Broken { url }) => self.registry.suspect(&url),
             Happened::Due => self.registry.handle_timeout(now()),
         }
     }

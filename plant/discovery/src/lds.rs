@@ -24,11 +24,11 @@ use tracing::{info, warn};
 
 use crate::client;
 use crate::clock;
-use crate::connection::{Asking, Counters, Shared};
+use crate::connection::{RegistryRequest, RequestCounters, ServerShared};
 use crate::endpoint;
 use crate::keeper::Keeper;
-use crate::security::{Security, TOLD_EVERY};
-use crate::services::{Answer, Own, Question, semaphore};
+use crate::security::{ChannelSecurity, TOLD_EVERY};
+use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery, semaphore};
 use mdns::Interface;
 use mdns::Url;
 use mdns::host_name;
@@ -113,13 +113,13 @@ impl LdsSettings {
         &self,
         application_uri: &str,
         host: &str,
-    ) -> Result<Option<Security>, Failure> {
+    ) -> Result<Option<ChannelSecurity>, Failure> {
         let Some(root) = self.pki.clone() else {
             return Ok(None);
         };
         let (uri, host, trust_any) = (application_uri.to_owned(), host.to_owned(), self.trust_any);
         // Generating a key takes some time, and must not block the program.
-        let open = move || Security::open(&root, &uri, &host, trust_any);
+        let open = move || ChannelSecurity::open(&root, &uri, &host, trust_any);
         let opened = spawn_blocking(open).await;
         let opened = opened.map_err(|error| Failure::new(FailureKind::Io, error.to_string()))??;
         let trusts = self
@@ -305,7 +305,7 @@ pub async fn run_around(
 /// A discovery server, which serves its clients during [`run`](Self::run).
 pub(crate) struct Lds {
     keeper: Keeper,
-    shared: Arc<Shared>,
+    shared: Arc<ServerShared>,
     interface: Interface,
     /// Its own mDNS instance name.
     instance: String,
@@ -329,7 +329,7 @@ impl Lds {
     pub(crate) async fn start(
         settings: &LdsSettings,
         (listener, place): (TcpListener, Url),
-    ) -> Result<(Self, mpsc::Receiver<Asking>), Failure> {
+    ) -> Result<(Self, mpsc::Receiver<RegistryRequest>), Failure> {
         let at = listener.local_addr().map_err(|error| {
             Failure::new(
                 FailureKind::Io,
@@ -359,7 +359,7 @@ impl Lds {
         let certificate = security
             .as_ref()
             .map(|own| own.certificate.as_byte_string());
-        let own = Own {
+        let own = OwnDescription {
             application_uri,
             name: settings.name(),
             url: url.clone(),
@@ -368,7 +368,8 @@ impl Lds {
         };
         let started = clock::wall();
         let (ask, questions) = mpsc::channel(64);
-        let shared = Arc::new(Shared::new(own, security, ask).secured_only(settings.secured_only));
+        let shared =
+            Arc::new(ServerShared::new(own, security, ask).secured_only(settings.secured_only));
         let mut accepting = JoinSet::new();
         accepting.spawn(endpoint::accept(listener, Arc::clone(&shared)));
         if let (Some(root), Some(gds)) = (&settings.pki, &settings.gds) {
@@ -423,14 +424,14 @@ impl Lds {
     }
 
     /// Returns the sender for requests of the embedding program.
-    pub(crate) fn asking(&self) -> mpsc::Sender<Asking> {
+    pub(crate) fn asking(&self) -> mpsc::Sender<RegistryRequest> {
         self.shared.ask.clone()
     }
 
     /// Serves requests until `stop` completes, and withdraws the announcement.
     pub(crate) async fn run(
         &mut self,
-        mut questions: mpsc::Receiver<Asking>,
+        mut questions: mpsc::Receiver<RegistryRequest>,
         pages: &mut Requests<LdsStatus>,
         stop: impl Future<Output = ()>,
     ) {
@@ -463,42 +464,42 @@ impl Lds {
         self.leave().await;
     }
 
-    fn answer(&mut self, question: Question, channel: &registry::Channel) -> Answer {
+    fn answer(&mut self, question: RegistryQuery, channel: &registry::Channel) -> RegistryAnswer {
         let registry = &mut self.keeper.registry;
         match question {
-            Question::FindServers { uris } => {
+            RegistryQuery::FindServers { uris } => {
                 let uris: Vec<&str> = uris.iter().map(String::as_str).collect();
                 let found = registry.find_servers(&uris);
                 let found = found.map(|(asked, _)| asked.clone());
                 let gated = self.around.iter().flat_map(|around| gated(around, &uris));
-                Answer::Servers(found.chain(gated).collect())
+                RegistryAnswer::Servers(found.chain(gated).collect())
             }
-            Question::FindOnNetwork {
+            RegistryQuery::FindOnNetwork {
                 from,
                 most,
                 capabilities,
             } => {
                 let capabilities: Vec<&str> = capabilities.iter().map(String::as_str).collect();
                 let records = registry.find_servers_on_network(from, most, &capabilities);
-                Answer::OnNetwork {
+                RegistryAnswer::OnNetwork {
                     records: records.into_iter().cloned().collect(),
                     reset: self.started,
                 }
             }
-            Question::Register {
+            RegistryQuery::Register {
                 asked,
                 semaphore_is_there,
             } => {
                 let uri = asked.server_uri.clone();
                 match registry.register(*asked, channel, semaphore_is_there, clock::now()) {
-                    Ok(_) => Answer::Registered,
+                    Ok(_) => RegistryAnswer::Registered,
                     Err(fault) => {
                         let (uri, why) = (cut(&uri), cut(&fault.to_string()));
                         let what = format!("{uri} {why}");
                         if let Some(untold) = self.refused.admit(&what, clock::now()) {
                             warn!(?uri, untold, "refused a registration: {why}");
                         }
-                        Answer::Refused(fault.status())
+                        RegistryAnswer::Refused(fault.status())
                     }
                 }
             }
@@ -646,7 +647,7 @@ impl Lds {
     /// Returns the counters, by their names in `/status`.
     pub(crate) fn counters(&self) -> BTreeMap<&'static str, u64> {
         let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        let Counters {
+        let RequestCounters {
             connections,
             refused_connections,
             refused_certificates,

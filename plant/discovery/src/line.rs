@@ -17,11 +17,11 @@ use opcua::types::{
 use tokio::net::{TcpStream, lookup_host};
 use tokio::time::{Instant, timeout, timeout_at};
 
-use crate::wire::{Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
+use crate::wire::{Conversation, FrameKind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
 use mdns::Url;
 
 /// A connection with an open channel.
-pub(crate) struct Line {
+pub(crate) struct OpenChannel {
     conversation: Conversation<TcpStream>,
     url: String,
     last_request: u32,
@@ -32,7 +32,7 @@ pub(crate) struct Line {
 /// The progress of a connection attempt.
 pub(crate) enum Reached {
     /// A channel is open.
-    Line(Box<Line>),
+    Line(Box<OpenChannel>),
     /// The server answers, but opens no channel.
     Answers,
     /// The host accepts the connection, but the program does not answer.
@@ -45,7 +45,7 @@ pub(crate) enum Reached {
     Untried,
 }
 
-impl Line {
+impl OpenChannel {
     /// Connects, and opens a channel if `hold` is set.
     pub(crate) async fn reach(url: &str, place: &Url, hold: bool, limit: Duration) -> Reached {
         let until = Instant::now() + limit;
@@ -139,7 +139,7 @@ async fn greet(conversation: &mut Conversation<TcpStream>, url: &str) -> Result<
     let (chunk, message, chunks) = (MOST_CHUNK, MOST_HEARD, MOST_CHUNKS);
     let hello = HelloMessage::new(url, chunk, chunk, message, chunks);
     conversation.greet(&hello).await?;
-    let acknowledge: AcknowledgeMessage = conversation.greeting(Kind::Acknowledge).await?;
+    let acknowledge: AcknowledgeMessage = conversation.greeting(FrameKind::Acknowledge).await?;
     conversation.limit(
         acknowledge.receive_buffer_size,
         acknowledge.max_message_size,
@@ -151,7 +151,7 @@ async fn greet(conversation: &mut Conversation<TcpStream>, url: &str) -> Result<
     clippy::wildcard_enum_match_arm,
     reason = "one message of all services opens a channel"
 )]
-async fn open(mut conversation: Conversation<TcpStream>, url: &str) -> Option<Line> {
+async fn open(mut conversation: Conversation<TcpStream>, url: &str) -> Option<OpenChannel> {
     let request = OpenSecureChannelRequest {
         request_header: header(1),
         request_type: SecurityTokenRequestType::Issue,
@@ -173,7 +173,7 @@ async fn open(mut conversation: Conversation<TcpStream>, url: &str) -> Option<Li
     };
     let lifetime = Duration::from_millis(token.revised_lifetime.into());
     conversation.channel.set_security_token(token);
-    Some(Line {
+    Some(OpenChannel {
         conversation,
         url: url.to_owned(),
         last_request: 1,

@@ -1,7 +1,7 @@
-//! Probes of servers: a task for each watched endpoint, which keeps a [`Line`] to it if the server
-//! accepts a channel, and otherwise connects for each probe.
+//! Probes of servers: a task for each watched endpoint, which keeps an [`OpenChannel`] to it if the
+//! server accepts a channel, and otherwise connects for each probe.
 //!
-//! The registry decides on the times of probes. The loss of a line is reported at once.
+//! The registry decides on the times of probes. The loss of a channel is reported at once.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -11,12 +11,12 @@ use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
 use crate::client;
-use crate::line::{Line, Reached};
+use crate::line::{OpenChannel, Reached};
 use mdns::Url;
 
 /// A report about an endpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Told {
+pub(crate) enum EndpointReport {
     /// The outcome of a probe.
     Tried { url: String, outcome: Outcome },
     /// The connection to the endpoint was lost.
@@ -35,8 +35,8 @@ pub(crate) struct Try {
 pub(crate) struct Liveness {
     endpoints: BTreeMap<String, Watched>,
     under_way: usize,
-    tell: mpsc::Sender<Told>,
-    told: mpsc::Receiver<Told>,
+    tell: mpsc::Sender<EndpointReport>,
+    told: mpsc::Receiver<EndpointReport>,
 }
 
 #[derive(Debug)]
@@ -78,20 +78,20 @@ impl Liveness {
     }
 
     /// Waits for the next report. Cancel safe.
-    pub(crate) async fn next(&mut self) -> Told {
+    pub(crate) async fn next(&mut self) -> EndpointReport {
         loop {
             let Some(told) = self.told.recv().await else {
                 // Cannot happen, because `self` holds a sender.
                 return std::future::pending().await;
             };
             let url = match &told {
-                Told::Tried { url, .. } | Told::Broken { url } => url,
+                EndpointReport::Tried { url, .. } | EndpointReport::Broken { url } => url,
             };
             // Reports of endpoints that are no longer watched are dropped.
             let Some(watched) = self.endpoints.get_mut(url) else {
                 continue;
             };
-            if matches!(told, Told::Tried { .. }) && watched.under_way {
+            if matches!(told, EndpointReport::Tried { .. }) && watched.under_way {
                 watched.under_way = false;
                 self.under_way = self.under_way.saturating_sub(1);
             }
@@ -114,7 +114,7 @@ impl Liveness {
 
 impl Watched {
     /// Starts the task of an endpoint, which ends when this value is dropped.
-    fn start(url: &str, may_hold: bool, tell: mpsc::Sender<Told>) -> Self {
+    fn start(url: &str, may_hold: bool, tell: mpsc::Sender<EndpointReport>) -> Self {
         let (ask, asked) = mpsc::channel(1);
         let endpoint = Endpoint {
             place: Url::parse(url),
@@ -133,13 +133,13 @@ impl Watched {
 struct Endpoint {
     url: String,
     place: Option<Url>,
-    line: Option<Line>,
+    line: Option<OpenChannel>,
     /// How many more channels may be opened: some servers close channels without a session.
     lines_left: u32,
 }
 
 impl Endpoint {
-    async fn run(mut self, mut asked: mpsc::Receiver<Try>, tell: mpsc::Sender<Told>) {
+    async fn run(mut self, mut asked: mpsc::Receiver<Try>, tell: mpsc::Sender<EndpointReport>) {
         loop {
             let broken = async {
                 match &mut self.line {
@@ -155,14 +155,14 @@ impl Endpoint {
                         outcome = self.attempt(attempt) => outcome,
                         () = closed(&mut asked) => return,
                     };
-                    Told::Tried { url: self.url.clone(), outcome }
+                    EndpointReport::Tried { url: self.url.clone(), outcome }
                 }
                 () = broken => {
                     self.line = None;
                     // A program that ends closes its sockets one after another; its listener may be
                     // next.
                     sleep(SETTLE).await;
-                    Told::Broken { url: self.url.clone() }
+                    EndpointReport::Broken { url: self.url.clone() }
                 }
             };
             if tell.send(told).await.is_err() {
@@ -179,7 +179,7 @@ impl Endpoint {
             return Outcome::Untried;
         };
         let alive = Outcome::Alive { start_time: None };
-        let line = self.line.take().filter(Line::is_good);
+        let line = self.line.take().filter(OpenChannel::is_good);
         let asking = ask(line);
         tokio::pin!(asking);
         let soon = timeout(SOON, &mut asking).await;
@@ -192,7 +192,7 @@ impl Endpoint {
             Ok(_) => LIMIT,
             Err(_) => LIMIT.saturating_sub(SOON),
         };
-        let anew = Line::reach(&self.url, &place, hold, rest);
+        let anew = OpenChannel::reach(&self.url, &place, hold, rest);
         tokio::pin!(anew);
         let reached = tokio::select! {
             Some(line) = &mut asking, if soon.is_err() => {
@@ -220,7 +220,7 @@ impl Endpoint {
     }
 }
 
-async fn ask(line: Option<Line>) -> Option<Line> {
+async fn ask(line: Option<OpenChannel>) -> Option<OpenChannel> {
     line?.ask().await
 }
 
@@ -253,8 +253,8 @@ mod tests {
     async fn tried(liveness: &mut Liveness, url: &str) -> Outcome {
         liveness.attempt(url, Try { ask_start: false });
         match liveness.next().await {
-            Told::Tried { outcome, .. } => outcome,
-            Told::Broken { .. } => panic!("there is no line"),
+            EndpointReport::Tried { outcome, .. } => outcome,
+            EndpointReport::Broken { .. } => panic!("there is no line"),
         }
     }
 
@@ -311,7 +311,7 @@ mod tests {
         }
         runtime.shutdown_background();
         let told = timeout(Duration::from_secs(5), liveness.next()).await;
-        assert_eq!(told, Ok(Told::Broken { url: url.clone() }));
+        assert_eq!(told, Ok(EndpointReport::Broken { url: url.clone() }));
         // The sockets of the runtime may close one after another.
         let gone = async { while tried(&mut liveness, &url).await != Outcome::Refused {} };
         timeout(Duration::from_secs(5), gone).await.unwrap();

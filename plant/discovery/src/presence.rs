@@ -7,35 +7,35 @@ use tokio::net::TcpListener;
 use tokio::sync::mpsc;
 
 use crate::announce::Server;
-use crate::connection::{Asking, Shared};
+use crate::connection::{RegistryRequest, ServerShared};
 use crate::endpoint;
-use crate::services::{Answer, Own, Question};
+use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery};
 
 /// Answers FindServers and GetEndpoints on a listener, over unsecured channels. Sessions and all
 /// other services are not supported. Ends when the future is dropped.
 pub async fn be_there(listener: TcpListener, server: &Server) {
-    let own = Own {
+    let own = OwnDescription {
         application_uri: server.application_uri.clone(),
         name: server.name.clone(),
         url: server.url.clone(),
         application_type: ApplicationType::Server,
         certificate: ByteString::null(),
     };
-    let (ask, mut questions) = mpsc::channel::<Asking>(16);
+    let (ask, mut questions) = mpsc::channel::<RegistryRequest>(16);
     let answers = async {
         while let Some((question, _, reply)) = questions.recv().await {
             let answer = match question {
                 // The response adds the server itself.
-                Question::FindServers { .. } => Answer::Servers(Vec::new()),
-                Question::FindOnNetwork { .. } | Question::Register { .. } => {
-                    Answer::Refused(UNSUPPORTED)
+                RegistryQuery::FindServers { .. } => RegistryAnswer::Servers(Vec::new()),
+                RegistryQuery::FindOnNetwork { .. } | RegistryQuery::Register { .. } => {
+                    RegistryAnswer::Refused(UNSUPPORTED)
                 }
             };
             // The client may have disconnected.
             drop(reply.send(answer));
         }
     };
-    let shared = Arc::new(Shared::new(own, None, ask));
+    let shared = Arc::new(ServerShared::new(own, None, ask));
     tokio::join!(endpoint::accept(listener, shared), answers);
 }
 

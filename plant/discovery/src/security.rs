@@ -22,7 +22,7 @@ use crate::clock;
 
 /// The certificate store of a discovery server, with the folders `own`, `private` and `trusted`.
 #[derive(Debug)]
-pub(crate) struct Security {
+pub(crate) struct ChannelSecurity {
     pub(crate) certificate: X509,
     pub(crate) key: PrivateKey,
     judge: Judge,
@@ -30,7 +30,7 @@ pub(crate) struct Security {
     refused: Mutex<LogLimit>,
 }
 
-impl Security {
+impl ChannelSecurity {
     /// Opens the store under `root`, and creates missing parts.
     pub(crate) fn open(
         root: &Path,

@@ -22,7 +22,7 @@ use crate::clock;
 
 /// A query of the registry.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Question {
+pub(crate) enum RegistryQuery {
     FindServers {
         uris: Vec<String>,
     },
@@ -39,7 +39,7 @@ pub(crate) enum Question {
 
 /// The answer of the registry.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Answer {
+pub(crate) enum RegistryAnswer {
     Servers(Vec<Asked>),
     OnNetwork {
         records: Vec<NetworkRecord>,
@@ -51,7 +51,7 @@ pub(crate) enum Answer {
 
 /// The description of the server that answers.
 #[derive(Debug, Clone)]
-pub(crate) struct Own {
+pub(crate) struct OwnDescription {
     pub(crate) application_uri: String,
     pub(crate) name: String,
     /// The URL for clients.
@@ -61,7 +61,7 @@ pub(crate) struct Own {
     pub(crate) certificate: ByteString,
 }
 
-impl Own {
+impl OwnDescription {
     fn description(&self) -> ApplicationDescription {
         ApplicationDescription {
             application_uri: self.application_uri.as_str().into(),
@@ -109,12 +109,12 @@ impl Own {
 }
 
 /// Returns the query of a request; `None` if the service is not a discovery service.
-pub(crate) fn question(request: &RequestMessage) -> Option<Question> {
+pub(crate) fn question(request: &RequestMessage) -> Option<RegistryQuery> {
     Some(match request {
-        RequestMessage::FindServers(request) => Question::FindServers {
+        RequestMessage::FindServers(request) => RegistryQuery::FindServers {
             uris: texts(request.server_uris.as_deref()),
         },
-        RequestMessage::FindServersOnNetwork(request) => Question::FindOnNetwork {
+        RequestMessage::FindServersOnNetwork(request) => RegistryQuery::FindOnNetwork {
             from: request.starting_record_id,
             most: request.max_records_to_return,
             capabilities: texts(request.server_capability_filter.as_deref()),
@@ -133,7 +133,7 @@ pub(crate) fn question(request: &RequestMessage) -> Option<Question> {
     })
 }
 
-fn register(server: &RegisteredServer, mdns: Option<MdnsConfiguration>) -> Question {
+fn register(server: &RegisteredServer, mdns: Option<MdnsConfiguration>) -> RegistryQuery {
     let names = server.server_names.iter().flatten();
     let asked = Asked {
         server_uri: text(&server.server_uri),
@@ -153,7 +153,7 @@ fn register(server: &RegisteredServer, mdns: Option<MdnsConfiguration>) -> Quest
         is_online: server.is_online,
         mdns,
     };
-    Question::Register {
+    RegistryQuery::Register {
         semaphore_is_there: semaphore(&asked.semaphore_file_path),
         asked: Box::new(asked),
     }
@@ -165,11 +165,15 @@ pub(crate) fn semaphore(path: &str) -> Option<bool> {
 }
 
 /// Returns the response to a request that [`question`] converted.
-pub(crate) fn response(request: &RequestMessage, answer: Answer, own: &Own) -> ResponseMessage {
+pub(crate) fn response(
+    request: &RequestMessage,
+    answer: RegistryAnswer,
+    own: &OwnDescription,
+) -> ResponseMessage {
     let good = || ResponseHeader::new_good(request.request_header());
     match (request, answer) {
-        (_, Answer::Refused(status)) => fault(request, StatusCode::from(status)),
-        (RequestMessage::FindServers(find), Answer::Servers(servers)) => {
+        (_, RegistryAnswer::Refused(status)) => fault(request, StatusCode::from(status)),
+        (RequestMessage::FindServers(find), RegistryAnswer::Servers(servers)) => {
             let itself = own.description();
             let uris = find.server_uris.as_deref().unwrap_or_default();
             let wanted = uris.is_empty() || uris.contains(&itself.application_uri);
@@ -180,7 +184,7 @@ pub(crate) fn response(request: &RequestMessage, answer: Answer, own: &Own) -> R
             };
             response.into()
         }
-        (RequestMessage::FindServersOnNetwork(_), Answer::OnNetwork { records, reset }) => {
+        (RequestMessage::FindServersOnNetwork(_), RegistryAnswer::OnNetwork { records, reset }) => {
             let response = FindServersOnNetworkResponse {
                 response_header: good(),
                 last_counter_reset_time: DateTime::from(clock::ticks(reset)),
@@ -188,11 +192,11 @@ pub(crate) fn response(request: &RequestMessage, answer: Answer, own: &Own) -> R
             };
             response.into()
         }
-        (RequestMessage::RegisterServer(_), Answer::Registered) => RegisterServerResponse {
+        (RequestMessage::RegisterServer(_), RegistryAnswer::Registered) => RegisterServerResponse {
             response_header: good(),
         }
         .into(),
-        (RequestMessage::RegisterServer2(request), Answer::Registered) => {
+        (RequestMessage::RegisterServer2(request), RegistryAnswer::Registered) => {
             // Only the first MdnsDiscoveryConfiguration is used.
             let mut taken = false;
             let all = request.discovery_configuration.iter().flatten();

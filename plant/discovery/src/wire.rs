@@ -75,7 +75,7 @@ impl WireFault {
 
 /// The MessageType: the first three letters of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Kind {
+pub(crate) enum FrameKind {
     Hello,
     Acknowledge,
     Error,
@@ -86,8 +86,8 @@ pub(crate) enum Kind {
 
 /// A frame with its header.
 #[derive(Debug)]
-pub(crate) struct Frame {
-    pub(crate) kind: Kind,
+pub(crate) struct UaFrame {
+    pub(crate) kind: FrameKind,
     /// The chunk type: `F`, `C` or `A`.
     last: u8,
     pub(crate) bytes: Bytes,
@@ -95,7 +95,7 @@ pub(crate) struct Frame {
 
 /// A message and its headers.
 #[derive(Debug)]
-pub(crate) struct Received<M> {
+pub(crate) struct ReceivedMessage<M> {
     pub(crate) message: M,
     pub(crate) request_id: u32,
     /// The security header of an OpenSecureChannel message.
@@ -133,7 +133,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
     }
 
     /// Receives the next frame.
-    pub(crate) async fn frame(&mut self) -> Result<Frame, WireFault> {
+    pub(crate) async fn frame(&mut self) -> Result<UaFrame, WireFault> {
         let mut header = [0; HEADER];
         match self.stream.read_exact(&mut header).await {
             Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
@@ -143,12 +143,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         };
         let [a, b, c, last, size @ ..] = header;
         let kind = match &[a, b, c] {
-            b"HEL" => Kind::Hello,
-            b"ACK" => Kind::Acknowledge,
-            b"ERR" => Kind::Error,
-            b"OPN" => Kind::Open,
-            b"CLO" => Kind::Close,
-            b"MSG" => Kind::Message,
+            b"HEL" => FrameKind::Hello,
+            b"ACK" => FrameKind::Acknowledge,
+            b"ERR" => FrameKind::Error,
+            b"OPN" => FrameKind::Open,
+            b"CLO" => FrameKind::Close,
+            b"MSG" => FrameKind::Message,
             _ => {
                 return Err(WireFault::bad(
                     StatusCode::BadTcpMessageTypeInvalid,
@@ -156,7 +156,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
                 ));
             }
         };
-        let whole = matches!(last, b'F') || (kind == Kind::Message && matches!(last, b'C' | b'A'));
+        let whole =
+            matches!(last, b'F') || (kind == FrameKind::Message && matches!(last, b'C' | b'A'));
         if !whole {
             return Err(WireFault::bad(
                 StatusCode::BadTcpMessageTypeInvalid,
@@ -176,16 +177,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             self.stream.read_exact(rest).await?;
         }
         let bytes = bytes.freeze();
-        Ok(Frame { kind, last, bytes })
+        Ok(UaFrame { kind, last, bytes })
     }
 
     /// Receives Hello or Acknowledge; an Error message becomes an error.
     pub(crate) async fn greeting<T: SimpleBinaryDecodable>(
         &mut self,
-        kind: Kind,
+        kind: FrameKind,
     ) -> Result<T, WireFault> {
         let frame = self.frame().await?;
-        if frame.kind == Kind::Error {
+        if frame.kind == FrameKind::Error {
             return Err(told(&frame));
         }
         if frame.kind != kind {
@@ -231,21 +232,21 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
     pub(crate) async fn receive<M: Message>(
         &mut self,
         admit: impl Fn(&AsymmetricSecurityHeader) -> Result<(), StatusCode>,
-    ) -> Result<Received<M>, WireFault> {
+    ) -> Result<ReceivedMessage<M>, WireFault> {
         let mut chunks: Vec<MessageChunk> = Vec::new();
         let mut size = 0;
         let mut opened = None;
         loop {
             let frame = self.frame().await?;
             match frame.kind {
-                Kind::Error => return Err(told(&frame)),
-                Kind::Hello | Kind::Acknowledge => {
+                FrameKind::Error => return Err(told(&frame)),
+                FrameKind::Hello | FrameKind::Acknowledge => {
                     return Err(WireFault::bad(
                         StatusCode::BadTcpMessageTypeInvalid,
                         "a second greeting",
                     ));
                 }
-                Kind::Open => {
+                FrameKind::Open => {
                     let header = opening(&frame.bytes)?;
                     self.check_renewal(&header)?;
                     admit(&header)
@@ -258,7 +259,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
                         ));
                     }
                 }
-                Kind::Close | Kind::Message => self.check_channel(&frame.bytes)?,
+                FrameKind::Close | FrameKind::Message => self.check_channel(&frame.bytes)?,
             }
             let last = frame.last;
             let chunk = self.unsecured(frame.bytes)?;
@@ -399,7 +400,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         &self,
         chunks: &[MessageChunk],
         opening: Option<AsymmetricSecurityHeader>,
-    ) -> Result<Received<M>, WireFault> {
+    ) -> Result<ReceivedMessage<M>, WireFault> {
         let checked = Chunker::validate_chunks(&self.channel, chunks);
         checked.map_err(|error| WireFault::of(&error, "chunks that do not belong together"))?;
         let first = chunks
@@ -414,7 +415,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
                 request_handle: handle.map_or(0, |(_, handle)| handle),
             }
         })?;
-        Ok(Received {
+        Ok(ReceivedMessage {
             message,
             request_id,
             opening,
@@ -445,7 +446,7 @@ fn decode<T: SimpleBinaryDecodable>(bytes: &[u8]) -> Result<T, Error> {
     T::decode(&mut Cursor::new(bytes), &options())
 }
 
-fn told(frame: &Frame) -> WireFault {
+fn told(frame: &UaFrame) -> WireFault {
     let message: Result<ErrorMessage, _> = decode(&frame.bytes);
     WireFault::Told(message.map_or(StatusCode::BadUnknownResponse, |message| message.error))
 }

@@ -43,7 +43,7 @@ pub enum ManifestError {
 
 /// An InternalElement, an ExternalInterface or an InstanceHierarchy.
 #[derive(Debug, Default)]
-pub(crate) struct Element {
+pub(crate) struct CaexElement {
     pub(crate) name: String,
     pub(crate) id: String,
     /// RefBaseSystemUnitPath, or RefBaseClassPath of an interface.
@@ -66,7 +66,7 @@ pub(crate) struct Attribute {
     pub(crate) is_link: bool,
 }
 
-impl Element {
+impl CaexElement {
     /// Reads a file.
     pub(crate) fn read(file: &str) -> Result<Self, ManifestError> {
         if file.len() > MAX_FILE {
@@ -154,12 +154,12 @@ impl Element {
 struct Building {
     open: Vec<Part>,
     elements: usize,
-    root: Option<Element>,
+    root: Option<CaexElement>,
 }
 
 #[derive(Debug)]
 enum Part {
-    Element(Element),
+    Element(CaexElement),
     Attribute(Attribute),
     Value,
     Other,
@@ -193,13 +193,13 @@ impl Building {
                 if path.is_empty() {
                     path = text("RefBaseClassPath")?;
                 }
-                Part::Element(Element {
+                Part::Element(CaexElement {
                     name: text("Name")?,
                     id: text("ID")?,
                     path,
                     line,
                     is_interface: tag == "ExternalInterface",
-                    ..Element::default()
+                    ..CaexElement::default()
                 })
             }
             "Attribute" if matches!(self.open.last(), Some(Part::Element(_))) => {
@@ -244,7 +244,7 @@ impl Building {
     }
 
     /// Returns the root element if it is complete.
-    fn root(self) -> Option<Element> {
+    fn root(self) -> Option<CaexElement> {
         self.root.filter(|_| self.open.is_empty())
     }
 }

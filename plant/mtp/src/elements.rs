@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use crate::caex::Element;
+use crate::caex::CaexElement;
 use crate::model::{Alarm, DataAssembly, Family, Link, Node, Output, OutputRole, Variable};
-use crate::read::{Reading, is_assembly, is_list, is_true};
+use crate::read::{ElementIndex, is_assembly, is_list, is_true};
 
 /// Returns the family of a data assembly by the whole path of its type.
 fn family(path: &str) -> Family {
@@ -35,9 +35,9 @@ fn family(path: &str) -> Family {
     }
 }
 
-impl<'a> Reading<'a> {
+impl<'a> ElementIndex<'a> {
     /// Reads all data assemblies below an element.
-    pub(crate) fn data_assemblies(&mut self, root: &'a Element) -> Vec<DataAssembly> {
+    pub(crate) fn data_assemblies(&mut self, root: &'a CaexElement) -> Vec<DataAssembly> {
         let mut found = Vec::new();
         let mut waiting = vec![(root, false)];
         while let Some((element, is_in_list)) = waiting.pop() {
@@ -53,7 +53,7 @@ impl<'a> Reading<'a> {
         found
     }
 
-    fn data_assembly(&mut self, element: &'a Element) -> DataAssembly {
+    fn data_assembly(&mut self, element: &'a CaexElement) -> DataAssembly {
         let mut variables = Vec::new();
         for attribute in &element.attributes {
             let value = attribute.value.trim();
@@ -84,7 +84,7 @@ impl<'a> Reading<'a> {
     }
 
     /// Reads the output values below a service or a procedure, or the values of a module.
-    pub(crate) fn outputs(&mut self, about: &str, of: &'a Element) -> Vec<Output> {
+    pub(crate) fn outputs(&mut self, about: &str, of: &'a CaexElement) -> Vec<Output> {
         let mut outputs = Vec::new();
         for child in &of.children {
             let Some(role) = role_of(child) else { continue };
@@ -103,7 +103,7 @@ impl<'a> Reading<'a> {
         outputs
     }
 
-    fn output(&mut self, element: &'a Element, role: OutputRole) -> Option<Output> {
+    fn output(&mut self, element: &'a CaexElement, role: OutputRole) -> Option<Output> {
         let assembly = self.data_assembly(self.value_assembly(element)?);
         Some(Output {
             id: element.id.clone(),
@@ -119,7 +119,7 @@ impl<'a> Reading<'a> {
     }
 
     /// Reads the IDs of the equipment that a service or a procedure requires.
-    pub(crate) fn equipment(&mut self, about: &str, of: &'a Element) -> Vec<String> {
+    pub(crate) fn equipment(&mut self, about: &str, of: &'a CaexElement) -> Vec<String> {
         let mut ids = Vec::new();
         for child in &of.children {
             if child.kind() != "RequiredEquipment" {
@@ -137,7 +137,7 @@ impl<'a> Reading<'a> {
     }
 
     /// Reads the alarms of a module.
-    pub(crate) fn alarms(&mut self, root: &'a Element) -> Vec<Alarm> {
+    pub(crate) fn alarms(&mut self, root: &'a CaexElement) -> Vec<Alarm> {
         let texts: BTreeMap<&str, &str> = root
             .all()
             .filter(|one| matches!(one.kind(), "AlarmMessage" | "AlarmText"))
@@ -186,7 +186,7 @@ impl<'a> Reading<'a> {
     }
 }
 
-fn role_of(element: &Element) -> Option<OutputRole> {
+fn role_of(element: &CaexElement) -> Option<OutputRole> {
     match element.kind() {
         "ReportValue" => Some(OutputRole::Report),
         "ProcessValueOut" => Some(OutputRole::ProcessValueOut),

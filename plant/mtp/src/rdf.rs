@@ -107,7 +107,7 @@ impl Module {
     /// `service/procedure`.
     #[must_use]
     pub fn triples(&self, base: &str, capabilities: &BTreeMap<String, Vec<String>>) -> Vec<Triple> {
-        let mut graph = Graph {
+        let mut graph = ModuleStatements {
             base,
             all: Vec::new(),
             taken: HashSet::new(),
@@ -160,14 +160,14 @@ impl fmt::Display for Identifier {
 }
 
 /// The statements about a module.
-pub(crate) struct Graph<'a> {
+pub(crate) struct ModuleStatements<'a> {
     base: &'a str,
     all: Vec<Triple>,
     taken: HashSet<String>,
     capabilities: &'a BTreeMap<String, Vec<String>>,
 }
 
-impl Graph<'_> {
+impl ModuleStatements<'_> {
     fn module(&mut self, module: &Module) {
         let iri = self.base.to_owned();
         self.taken.insert(iri.clone());

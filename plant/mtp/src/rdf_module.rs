@@ -1,11 +1,11 @@
 //! Statements about the servers, nodes, data assemblies, outputs and state machines of a module.
 
 use crate::model::{Alarm, DataAssembly, Family, Link, Module, Output, OutputRole, Role, Service};
-use crate::rdf::{Graph, Object, escaped};
+use crate::rdf::{ModuleStatements, Object, escaped};
 use crate::state::{Command, State};
 use crate::vocabulary as v;
 
-impl Graph<'_> {
+impl ModuleStatements<'_> {
     /// Adds everything except the services.
     pub(crate) fn whole(&mut self, iri: &str, module: &Module) {
         for server in &module.servers {

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 
-use crate::caex::{Element, MAX_FILE, ManifestError};
+use crate::caex::{CaexElement, MAX_FILE, ManifestError};
 use crate::container;
 use crate::model::{
     Access, Bound, Control, Edition, Finding, Identifier, Item, Module, Node, OpcUaServer,
@@ -35,7 +35,7 @@ impl Module {
             true => Cow::Owned(container::document(file)?),
             false => Cow::Borrowed(file),
         };
-        let mut root = Element::read(&xml_text::decode(&unpacked)?)?;
+        let mut root = CaexElement::read(&xml_text::decode(&unpacked)?)?;
         let mut missing = Vec::new();
         let mut total = unpacked.len();
         for (reference, line) in references(&root) {
@@ -57,7 +57,7 @@ impl Module {
                     most: MAX_FILE,
                 });
             }
-            let part = Element::read(&xml_text::decode(&document)?)?;
+            let part = CaexElement::read(&xml_text::decode(&document)?)?;
             root.children.extend(part.children);
         }
         let mut module = Self::of(&root)?;
@@ -78,14 +78,14 @@ impl Module {
     /// [`ManifestError`] if the file is not a manifest. Inconsistencies in a manifest are in
     /// [`findings`](Self::findings).
     pub fn read(manifest: &str) -> Result<Self, ManifestError> {
-        Self::of(&Element::read(manifest)?)
+        Self::of(&CaexElement::read(manifest)?)
     }
 
-    fn of(root: &Element) -> Result<Self, ManifestError> {
-        let of_module = |element: &&Element| element.path == "MTPSUCLib/ModuleTypePackage";
+    fn of(root: &CaexElement) -> Result<Self, ManifestError> {
+        let of_module = |element: &&CaexElement| element.path == "MTPSUCLib/ModuleTypePackage";
         let mut modules = root.all().filter(of_module);
         let module = modules.next().ok_or(ManifestError::NoModule)?;
-        let mut reading = Reading::of(root);
+        let mut reading = ElementIndex::of(root);
         for other in modules {
             let what = "the file describes several modules, and the first is read";
             reading.find(other, &other.name, what);
@@ -124,7 +124,7 @@ impl Module {
 }
 
 /// Returns the relative paths of other documents in the attributes `refURI`, with their lines.
-fn references(root: &Element) -> Vec<(String, usize)> {
+fn references(root: &CaexElement) -> Vec<(String, usize)> {
     let mut found: Vec<(String, usize)> = Vec::new();
     for element in root.all() {
         let Some(reference) = element.value(&["refURI"]) else {
@@ -145,7 +145,7 @@ fn references(root: &Element) -> Vec<(String, usize)> {
 }
 
 /// Returns whether an element without a type is the set of process values, as in early files.
-fn is_process_values(element: &Element) -> bool {
+fn is_process_values(element: &CaexElement) -> bool {
     element.path.is_empty()
         && element.children.iter().any(|child| {
             child
@@ -155,16 +155,16 @@ fn is_process_values(element: &Element) -> bool {
 }
 
 /// Index of the elements that are referenced in a file.
-pub(crate) struct Reading<'a> {
+pub(crate) struct ElementIndex<'a> {
     /// OPCUAItems by their ID.
     nodes: HashMap<&'a str, Node>,
     /// ServiceControls and data assemblies of parameters by their RefID, and by their ID for files
     /// with services that reference the ID.
-    assemblies: HashMap<&'a str, &'a Element>,
+    assemblies: HashMap<&'a str, &'a CaexElement>,
     /// All other data assemblies in the same way.
-    values: HashMap<&'a str, &'a Element>,
+    values: HashMap<&'a str, &'a CaexElement>,
     /// All elements by their ID.
-    elements: HashMap<&'a str, &'a Element>,
+    elements: HashMap<&'a str, &'a CaexElement>,
     /// The values of attributes by their ID.
     attributes: HashMap<&'a str, &'a str>,
     endpoints: Vec<String>,
@@ -173,8 +173,8 @@ pub(crate) struct Reading<'a> {
     findings: Vec<Finding>,
 }
 
-impl<'a> Reading<'a> {
-    fn of(root: &'a Element) -> Self {
+impl<'a> ElementIndex<'a> {
+    fn of(root: &'a CaexElement) -> Self {
         let mut reading = Self {
             nodes: HashMap::new(),
             assemblies: HashMap::new(),
@@ -230,7 +230,7 @@ impl<'a> Reading<'a> {
         reading
     }
 
-    fn server(&mut self, server: &'a Element) {
+    fn server(&mut self, server: &'a CaexElement) {
         let endpoint = server.value(&["Endpoint"]).unwrap_or_default();
         if endpoint.is_empty() {
             self.find(server, &server.name, "the OPCUAServer has no Endpoint");
@@ -245,7 +245,7 @@ impl<'a> Reading<'a> {
         });
     }
 
-    fn item(&mut self, item: &'a Element, server: Option<&Element>) {
+    fn item(&mut self, item: &'a CaexElement, server: Option<&CaexElement>) {
         let Some(server) = server else {
             self.find(
                 item,
@@ -296,14 +296,14 @@ impl<'a> Reading<'a> {
     }
 
     /// Returns the data assembly of any kind that an element references by its RefID.
-    pub(crate) fn value_assembly(&self, element: &Element) -> Option<&'a Element> {
+    pub(crate) fn value_assembly(&self, element: &CaexElement) -> Option<&'a CaexElement> {
         let id = element.value(&["RefID"])?;
         let found = self.values.get(id).or_else(|| self.assemblies.get(id));
         found.copied()
     }
 
     /// Adds a note for each kind of elements that have no place in the model.
-    fn left_out(&mut self, root: &'a Element) {
+    fn left_out(&mut self, root: &'a CaexElement) {
         let mut kinds: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
         let mut waiting = vec![(root, false)];
         while let Some((element, is_in_list)) = waiting.pop() {
@@ -338,7 +338,7 @@ impl<'a> Reading<'a> {
         }
     }
 
-    fn service(&mut self, element: &'a Element) -> Service {
+    fn service(&mut self, element: &'a CaexElement) -> Service {
         let control = match self.assembly(element) {
             Some(assembly) if assembly.kind() == "ServiceControl" => self.control(assembly),
             _ => {
@@ -386,7 +386,7 @@ impl<'a> Reading<'a> {
         }
     }
 
-    fn procedure(&mut self, service: &str, element: &'a Element) -> Option<Procedure> {
+    fn procedure(&mut self, service: &str, element: &'a CaexElement) -> Option<Procedure> {
         let about = format!("{service}/{}", element.name);
         let number = element.value(&["ProcedureID", "ProcedureId", "StrategyID"]);
         let Some(number) = number.and_then(|number| number.parse().ok()) else {
@@ -398,7 +398,7 @@ impl<'a> Reading<'a> {
             return None;
         };
         let required = required(element).filter_map(|id| self.elements.get(id).copied());
-        let parts: Vec<&Element> = element
+        let parts: Vec<&CaexElement> = element
             .children
             .iter()
             .filter(|child| is_parameter(child))
@@ -421,7 +421,7 @@ impl<'a> Reading<'a> {
         })
     }
 
-    fn parameter(&mut self, about: &str, element: &'a Element) -> Option<Parameter> {
+    fn parameter(&mut self, about: &str, element: &'a CaexElement) -> Option<Parameter> {
         let assembly = self.assembly(element);
         let Some((assembly, kind)) = assembly.and_then(|found| Some((found, kind_of(found)?)))
         else {
@@ -450,7 +450,7 @@ impl<'a> Reading<'a> {
         })
     }
 
-    fn control(&mut self, assembly: &Element) -> Control {
+    fn control(&mut self, assembly: &CaexElement) -> Control {
         let roles = ROLES
             .iter()
             .filter_map(|(role, names)| Some((*role, self.node(assembly, names)?)));
@@ -458,15 +458,15 @@ impl<'a> Reading<'a> {
     }
 
     /// Returns the element that a service, procedure or parameter references by its RefID.
-    fn assembly(&self, element: &Element) -> Option<&'a Element> {
+    fn assembly(&self, element: &CaexElement) -> Option<&'a CaexElement> {
         self.assemblies.get(element.value(&["RefID"])?).copied()
     }
 
-    fn node(&self, assembly: &Element, names: &[&str]) -> Option<Node> {
+    fn node(&self, assembly: &CaexElement, names: &[&str]) -> Option<Node> {
         self.nodes.get(assembly.value(names)?).cloned()
     }
 
-    fn bound(&self, assembly: &Element, name: &str) -> Option<Bound> {
+    fn bound(&self, assembly: &CaexElement, name: &str) -> Option<Bound> {
         let value = assembly.value(&[name])?;
         match self.nodes.get(value) {
             Some(node) => Some(Bound::Node(node.clone())),
@@ -475,7 +475,7 @@ impl<'a> Reading<'a> {
     }
 
     /// Adds a finding about an element.
-    pub(crate) fn find(&mut self, element: &Element, about: &str, what: &str) {
+    pub(crate) fn find(&mut self, element: &CaexElement, about: &str, what: &str) {
         let finding = Finding {
             about: about.to_owned(),
             what: what.to_owned(),
@@ -490,14 +490,14 @@ impl<'a> Reading<'a> {
 
 /// Returns the IDs in RequiredParameters, by which strategies reference the parameters of their
 /// service.
-fn required(strategy: &Element) -> impl Iterator<Item = &str> {
+fn required(strategy: &CaexElement) -> impl Iterator<Item = &str> {
     let ids = strategy.value(&["RequiredParameters"]).unwrap_or_default();
     ids.split_whitespace()
 }
 
 /// Returns whether an element is a data assembly. Drafts have parameters and services of the
 /// instance list in the library of services.
-pub(crate) fn is_assembly(element: &Element, is_in_list: bool) -> bool {
+pub(crate) fn is_assembly(element: &CaexElement, is_in_list: bool) -> bool {
     let (library, rest) = element.path.split_once('/').unwrap_or_default();
     match library {
         "MTPDataObjectSUCLib" | "MTPDataAssemblySUCLib" => rest.starts_with("DataAssembly/"),
@@ -506,26 +506,26 @@ pub(crate) fn is_assembly(element: &Element, is_in_list: bool) -> bool {
 }
 
 /// Returns whether the children of an element are data assemblies.
-pub(crate) fn is_list(element: &Element) -> bool {
+pub(crate) fn is_list(element: &CaexElement) -> bool {
     element.kind() == "InstanceList"
         || (element.path.is_empty() && element.name == "DataAssemblies")
 }
 
-fn is_procedure(element: &Element) -> bool {
+fn is_procedure(element: &CaexElement) -> bool {
     matches!(
         element.kind(),
         "Procedure" | "ServiceProcedure" | "ServiceStrategy"
     )
 }
 
-fn is_parameter(element: &Element) -> bool {
+fn is_parameter(element: &CaexElement) -> bool {
     matches!(
         element.kind(),
         "ConfigurationParameter" | "ProcedureParameter" | "StrategyParameter"
     )
 }
 
-fn kind_of(assembly: &Element) -> Option<ValueKind> {
+fn kind_of(assembly: &CaexElement) -> Option<ValueKind> {
     match assembly.kind() {
         "AnaServParam" => Some(ValueKind::Analog),
         "DIntServParam" | "DigServParam" => Some(ValueKind::Integer),

@@ -22,33 +22,33 @@ pub struct Mapping {
 #[non_exhaustive]
 pub enum MappingFault {
     /// The mapping is not Turtle.
-    #[error("line {line}: {what}")]
+    #[error("line {line}: {problem}")]
     Turtle {
         /// Line, from 1.
         line: u64,
         /// Description of the error.
-        what: String,
+        problem: String,
     },
     /// The mapping exceeds a limit, or has no triples map.
     #[error("{0}")]
     Whole(String),
     /// A triples map is wrong.
-    #[error("triples map {map}: {what}")]
+    #[error("triples map {map}: {problem}")]
     Map {
         /// The IRI of the triples map.
         map: String,
         /// Description of the error and its remedy.
-        what: String,
+        problem: String,
     },
     /// A file cannot be read.
-    #[error("triples map {map}: source `{file}`: {what}")]
+    #[error("triples map {map}: source `{file}`: {problem}")]
     File {
         /// The IRI of a triples map that reads it.
         map: String,
         /// The name in the mapping.
         file: String,
         /// Description of the error, with the line if it is known.
-        what: String,
+        problem: String,
     },
 }
 
@@ -89,13 +89,13 @@ pub(crate) enum ObjectMap {
     Parent {
         /// Index of the triples map.
         map: usize,
-        joins: Vec<Condition>,
+        joins: Vec<JoinCondition>,
     },
 }
 
 /// Equality of a value of the row and a value of a row of the parent.
 #[derive(Debug, Clone)]
-pub(crate) struct Condition {
+pub(crate) struct JoinCondition {
     pub(crate) child: Expression,
     pub(crate) parent: Expression,
 }
@@ -117,7 +117,7 @@ pub(crate) enum TermValue {
 /// An expression for texts.
 #[derive(Debug, Clone)]
 pub(crate) struct Expression {
-    pub(crate) parts: Vec<Part>,
+    pub(crate) parts: Vec<TemplatePart>,
     /// Whether it is a template: values in IRIs are escaped.
     pub(crate) is_template: bool,
     /// The text in the mapping.
@@ -125,7 +125,7 @@ pub(crate) struct Expression {
 }
 
 #[derive(Debug, Clone)]
-pub(crate) enum Part {
+pub(crate) enum TemplatePart {
     Text(String),
     Value(Expr),
 }

@@ -38,7 +38,7 @@ impl Mapping {
         for triple in parser.by_ref() {
             let triple = triple.map_err(|fault| MappingFault::Turtle {
                 line: fault.location().start.line + 1,
-                what: fault.message().to_owned(),
+                problem: fault.message().to_owned(),
             })?;
             statements.push(triple);
         }
@@ -161,9 +161,9 @@ impl<'a> Reading<'a> {
         }
         let names = self.names.clone();
         let read = names.into_iter().map(|name| {
-            self.map(name).map_err(|what| MappingFault::Map {
+            self.map(name).map_err(|problem| MappingFault::Map {
                 map: name.to_string(),
-                what,
+                problem,
             })
         });
         read.collect()
@@ -299,7 +299,7 @@ impl<'a> Reading<'a> {
         let mut joins = Vec::new();
         for join in self.graph.all(node, "joinCondition") {
             let join = self.node(join, "joinCondition")?;
-            joins.push(crate::mapping::Condition {
+            joins.push(crate::mapping::JoinCondition {
                 child: self.side(join, "child", scope)?,
                 parent: self.side(join, "parent", &parent_scope)?,
             });
@@ -319,7 +319,7 @@ impl<'a> Reading<'a> {
         let file = self.file(source.ok_or("the logical source has no rml:source")?)?;
         let written = self.graph.text(node, "iterator")?.unwrap_or("/");
         let iterator = parse(written, &namespaces)
-            .map_err(|what| format!("the iterator `{written}`: {what}"))?;
+            .map_err(|problem| format!("the iterator `{written}`: {problem}"))?;
         let source = LogicalSource {
             file,
             iterator,
@@ -424,8 +424,8 @@ impl<'a> Reading<'a> {
             .ok_or_else(|| format!("nothing is stated about {term}, the `{property}`"))
     }
 
-    fn note(&mut self, map: &NamedOrBlankNode, what: &str) {
-        self.findings.insert(format!("triples map {map}: {what}"));
+    fn note(&mut self, map: &NamedOrBlankNode, finding: &str) {
+        self.findings.insert(format!("triples map {map}: {finding}"));
     }
 
     /// Notes the properties of RML that are ignored here.
@@ -433,7 +433,7 @@ impl<'a> Reading<'a> {
         &mut self,
         map: &NamedOrBlankNode,
         node: &NamedOrBlankNode,
-        what: &str,
+        subject: &str,
         known: &[&str],
     ) {
         let ignored: Vec<String> = self
@@ -442,10 +442,10 @@ impl<'a> Reading<'a> {
             .iter()
             .filter_map(|statement| local(statement.predicate.as_str()))
             .filter(|name| !known.contains(name))
-            .map(|name| format!("`{name}` of {what} is ignored"))
+            .map(|name| format!("`{name}` of {subject} is ignored"))
             .collect();
-        for what in ignored {
-            self.note(map, &what);
+        for finding in ignored {
+            self.note(map, &finding);
         }
     }
 }

@@ -8,11 +8,11 @@ use roxmltree::{Document, ParsingOptions};
 
 use crate::files::Files;
 use crate::mapping::{
-    Condition, Expression, Mapping, MappingFault, ObjectMap, Part, PredicateObject, TermKind,
-    TermMap, TermValue, TriplesMap,
+    Expression, JoinCondition, Mapping, MappingFault, ObjectMap, PredicateObject, TemplatePart,
+    TermKind, TermMap, TermValue, TriplesMap,
 };
 use crate::read::{blank, is_default_graph, is_language};
-use crate::xpath::{Evaluator, NodeRef, Work};
+use crate::xpath::{Evaluator, NodeRef, WorkBudget};
 
 /// The statements of a run.
 #[derive(Debug, Clone)]
@@ -30,10 +30,10 @@ impl Mapping {
     /// # Errors
     /// [`MappingFault`] if a file cannot be read, or a limit is exceeded.
     pub fn run(&self, files: &mut dyn Files) -> Result<Output, MappingFault> {
-        self.run_within(files, Work::new(MAX_WORK))
+        self.run_within(files, WorkBudget::new(MAX_WORK))
     }
 
-    fn run_within(&self, files: &mut dyn Files, work: Work) -> Result<Output, MappingFault> {
+    fn run_within(&self, files: &mut dyn Files, work: WorkBudget) -> Result<Output, MappingFault> {
         let texts = self.texts(files)?;
         let mut documents = Vec::new();
         for (file, text) in &texts {
@@ -66,16 +66,16 @@ impl Mapping {
         }
         run.rows()?;
         for (number, map) in self.maps.iter().enumerate() {
-            run.map(number, map).map_err(|what| MappingFault::Map {
+            run.map(number, map).map_err(|problem| MappingFault::Map {
                 map: map.name.clone(),
-                what,
+                problem,
             })?;
         }
         let findings = run.findings.into_iter();
         Ok(Output {
             quads: run.sink.quads,
             findings: findings
-                .map(|(what, times)| repeated(what, times))
+                .map(|(problem, times)| repeated(problem, times))
                 .collect(),
             prefixes: self.prefixes.clone(),
         })
@@ -88,7 +88,7 @@ impl Mapping {
         for file in self.files() {
             let bytes = files
                 .read(file)
-                .map_err(|what| self.file_fault(file, what))?;
+                .map_err(|problem| self.file_fault(file, problem))?;
             let text = xml_text::decode(&bytes)
                 .map_err(|fault| self.file_fault(file, fault.to_string()))?;
             total += text.len();
@@ -99,15 +99,15 @@ impl Mapping {
             }
             // The parser compares the attributes of an element pairwise.
             if xml_text::has_more_attributes(&text, MAX_ATTRIBUTES) {
-                let what = format!("an element has more than {MAX_ATTRIBUTES} attributes");
-                return Err(self.file_fault(file, what));
+                let problem = format!("an element has more than {MAX_ATTRIBUTES} attributes");
+                return Err(self.file_fault(file, problem));
             }
             texts.push((file, text.into_owned()));
         }
         Ok(texts)
     }
 
-    fn file_fault(&self, file: &str, what: String) -> MappingFault {
+    fn file_fault(&self, file: &str, problem: String) -> MappingFault {
         let reads = |map: &&TriplesMap| {
             let source = self.sources.get(map.source);
             source.is_some_and(|source| source.file == file)
@@ -116,7 +116,7 @@ impl Mapping {
         MappingFault::File {
             map: map.map(|map| map.name.clone()).unwrap_or_default(),
             file: file.to_owned(),
-            what,
+            problem,
         }
     }
 }
@@ -128,7 +128,7 @@ struct Run<'a> {
     file_of_source: Vec<usize>,
     /// The rows by source.
     rows: Vec<Rc<Vec<NodeRef>>>,
-    work: Work,
+    work: WorkBudget,
     sink: Sink,
     blank_nodes: HashMap<String, BlankNode>,
     findings: BTreeMap<String, usize>,
@@ -191,9 +191,9 @@ impl<'a> Run<'a> {
                 Some(evaluator) => evaluator.rows(&source.iterator, &mut self.work),
                 None => Ok(Vec::new()),
             };
-            let rows = rows.map_err(|what| {
-                let what = format!("the iterator `{}`: {what}", source.written);
-                mapping.file_fault(&source.file, what)
+            let rows = rows.map_err(|problem| {
+                let problem = format!("the iterator `{}`: {problem}", source.written);
+                mapping.file_fault(&source.file, problem)
             })?;
             self.rows.push(Rc::new(rows));
         }
@@ -318,7 +318,7 @@ impl<'a> Run<'a> {
     fn parents(
         &mut self,
         map: &'a TriplesMap,
-        (number, joins): (usize, &'a [Condition]),
+        (number, joins): (usize, &'a [JoinCondition]),
         row: Row<'a>,
     ) -> Result<Vec<Term>, String> {
         let mapping = self.mapping;
@@ -374,7 +374,7 @@ impl<'a> Run<'a> {
         &mut self,
         number: usize,
         map: &'a TriplesMap,
-        joins: &'a [Condition],
+        joins: &'a [JoinCondition],
     ) -> Result<Rc<RowIndex>, String> {
         let written = joins.iter().map(|join| join.parent.written.clone());
         let key = (number, written.collect());
@@ -499,14 +499,14 @@ impl<'a> Run<'a> {
         let mut texts = vec![String::new()];
         for part in &expression.parts {
             let values = match part {
-                Part::Text(text) => vec![text.clone()],
-                Part::Value(expr) => {
+                TemplatePart::Text(text) => vec![text.clone()],
+                TemplatePart::Value(expr) => {
                     let Some(evaluator) = self.evaluators.get_mut(row.file) else {
                         return Ok(Vec::new());
                     };
                     let values = evaluator.values(expr, row.node, &mut self.work);
                     let mut values =
-                        values.map_err(|what| format!("`{}`: {what}", expression.written))?;
+                        values.map_err(|problem| format!("`{}`: {problem}", expression.written))?;
                     if expression.is_template && kind == TermKind::Iri {
                         for value in &mut values {
                             *value = escaped(value);
@@ -522,14 +522,14 @@ impl<'a> Run<'a> {
         Ok(texts)
     }
 
-    fn find(&mut self, row: Row<'_>, what: String) {
-        let what = format!("triples map {}: {what}", row.map);
-        if self.findings.len() >= MAX_FINDINGS && !self.findings.contains_key(&what) {
+    fn find(&mut self, row: Row<'_>, problem: String) {
+        let problem = format!("triples map {}: {problem}", row.map);
+        if self.findings.len() >= MAX_FINDINGS && !self.findings.contains_key(&problem) {
             let others = "further values are no terms".to_owned();
             *self.findings.entry(others).or_default() += 1;
             return;
         }
-        *self.findings.entry(what).or_default() += 1;
+        *self.findings.entry(problem).or_default() += 1;
     }
 }
 
@@ -656,10 +656,10 @@ fn shortened(value: &str) -> String {
     short
 }
 
-fn repeated(what: String, times: usize) -> String {
+fn repeated(problem: String, times: usize) -> String {
     match times {
-        1 => what,
-        times => format!("{what} ({times} times)"),
+        1 => problem,
+        times => format!("{problem} ({times} times)"),
     }
 }
 
@@ -724,7 +724,7 @@ mod tests {
     fn a_run_ends_at_the_limit_of_its_work() {
         let mapping = "@prefix r: <http://w3id.org/rml/> . <urn:m> r:logicalSource [ r:source \"a\"; r:referenceFormulation r:XPath; r:iterator \"//a\" ]; r:subject <urn:s>; r:predicateObjectMap [ r:predicate <urn:p>; r:objectMap [ r:reference \"//a[.//a//a]\" ] ] .";
         let mapping = Mapping::read(mapping).unwrap();
-        let run = mapping.run_within(&mut Deep, Work::new(200_000));
+        let run = mapping.run_within(&mut Deep, WorkBudget::new(200_000));
         let fault = run.unwrap_err().to_string();
         assert!(fault.contains("narrow its paths"), "{fault}");
     }

@@ -12,7 +12,7 @@ mod tokens;
 use std::fmt;
 use std::sync::Arc;
 
-pub(crate) use evaluate::{Evaluator, NodeRef, Work};
+pub(crate) use evaluate::{Evaluator, NodeRef, WorkBudget};
 pub(crate) use parse::parse;
 
 /// The namespaces of prefixes in expressions. Without any, names match in all namespaces.
@@ -27,7 +27,7 @@ pub(crate) enum Expr {
     Calculate(Operator, Box<Self>, Box<Self>),
     Negate(Box<Self>),
     Union(Box<Self>, Box<Self>),
-    Path(Box<Path>),
+    Path(Box<LocationPath>),
     Text(String),
     Number(f64),
     Call(Function, Vec<Self>),
@@ -54,11 +54,11 @@ pub(crate) enum Operator {
 
 /// A location path.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Path {
+pub(crate) struct LocationPath {
     pub(crate) start: Start,
-    pub(crate) steps: Vec<Step>,
+    pub(crate) steps: Vec<XPathStep>,
     /// The index of an absolute path: its nodes are the same for all rows up to this step.
-    pub(crate) index: Option<Index>,
+    pub(crate) index: Option<PathIndex>,
 }
 
 /// Start of a location path.
@@ -71,7 +71,7 @@ pub(crate) enum Start {
 
 /// The leading steps of an absolute path whose nodes do not depend on the row.
 #[derive(Clone)]
-pub(crate) struct Index {
+pub(crate) struct PathIndex {
     /// Identifies the steps within a document.
     pub(crate) key: Arc<str>,
     /// Number of leading steps.
@@ -81,13 +81,13 @@ pub(crate) struct Index {
 }
 
 // An index follows from the steps of its path, which are shown and compared beside it.
-impl fmt::Debug for Index {
+impl fmt::Debug for PathIndex {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Index")
     }
 }
 
-impl PartialEq for Index {
+impl PartialEq for PathIndex {
     fn eq(&self, other: &Self) -> bool {
         self.key == other.key
     }
@@ -110,7 +110,7 @@ pub(crate) struct Join {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Step {
+pub(crate) struct XPathStep {
     pub(crate) axis: Axis,
     pub(crate) test: Test,
     pub(crate) predicates: Vec<Expr>,
@@ -151,12 +151,12 @@ pub(crate) enum Test {
     Comment,
     Instruction(Option<String>),
     /// An element or attribute. Without a name, any of the namespace.
-    Name(Space, Option<String>),
+    Name(NamespaceTest, Option<String>),
 }
 
 /// The namespace of a name.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Space {
+pub(crate) enum NamespaceTest {
     Any,
     None,
     Uri(String),
@@ -293,7 +293,7 @@ impl Expr {
                     }
                     Start::Context | Start::Root => false,
                 };
-                start || path.steps.iter().any(Step::has_current)
+                start || path.steps.iter().any(XPathStep::has_current)
             }
             Self::Call(Function::Current, _) => true,
             Self::Call(_, all) => all.iter().any(Self::has_current),
@@ -350,7 +350,7 @@ impl Expr {
     }
 }
 
-impl Step {
+impl XPathStep {
     pub(crate) fn has_current(&self) -> bool {
         self.predicates.iter().any(Expr::has_current)
     }

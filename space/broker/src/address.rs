@@ -5,7 +5,7 @@ use uadp::action::{ActionDialect, ActionKind};
 use uadp::discovery::{Announced, Announcement, ConnectionState, CyclicStatus};
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId};
 
-use crate::topics::{Address, MessageType};
+use crate::topics::{Address, TopicMessageType};
 
 /// The evaluation of a NetworkMessage.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,12 +32,12 @@ pub(crate) fn of(message: &NetworkMessage<'_>, own: Option<u16>) -> Option<Addre
         withdrawn: None,
     };
     match message.message_type() {
-        NetworkMessageType::Probe => Some(addressed(alone(MessageType::Probe, publisher))),
+        NetworkMessageType::Probe => Some(addressed(alone(TopicMessageType::Probe, publisher))),
         NetworkMessageType::Announcement => Some(announcement(message, publisher)),
         NetworkMessageType::DataSet if is_action(message) => {
             Some(addressed(address(action_kind(message, publisher, own))))
         }
-        NetworkMessageType::DataSet => Some(addressed(address(MessageType::Data))),
+        NetworkMessageType::DataSet => Some(addressed(address(TopicMessageType::Data))),
     }
 }
 
@@ -72,7 +72,7 @@ pub(crate) fn status(
     }
 }
 
-const fn alone(kind: MessageType, publisher: u16) -> Address {
+const fn alone(kind: TopicMessageType, publisher: u16) -> Address {
     Address {
         kind,
         publisher,
@@ -87,23 +87,23 @@ fn is_action(message: &NetworkMessage<'_>) -> bool {
 }
 
 /// The PublisherId is that of the executor, in requests and in responses.
-fn action_kind(message: &NetworkMessage<'_>, publisher: u16, own: Option<u16>) -> MessageType {
+fn action_kind(message: &NetworkMessage<'_>, publisher: u16, own: Option<u16>) -> TopicMessageType {
     let readable = message.is_action() && !message.is_sealed() && !message.is_chunk();
     let actions = readable.then(|| message.actions(ActionDialect::Standard).ok());
     let first = actions
         .flatten()
         .and_then(|mut actions| actions.next()?.ok());
     match first.map(|first| first.action.kind) {
-        Some(ActionKind::Request) => MessageType::ActionRequest,
-        Some(ActionKind::Response) => MessageType::ActionResponse,
-        None if own == Some(publisher) => MessageType::ActionResponse,
-        None => MessageType::ActionRequest,
+        Some(ActionKind::Request) => TopicMessageType::ActionRequest,
+        Some(ActionKind::Response) => TopicMessageType::ActionResponse,
+        None if own == Some(publisher) => TopicMessageType::ActionResponse,
+        None => TopicMessageType::ActionRequest,
     }
 }
 
 fn announcement(message: &NetworkMessage<'_>, publisher: u16) -> Addressed {
     let hidden = Addressed {
-        address: alone(MessageType::Discovery, publisher),
+        address: alone(TopicMessageType::Discovery, publisher),
         withdrawn: None,
     };
     if message.is_sealed() || message.is_chunk() {
@@ -132,22 +132,22 @@ fn announcement(message: &NetworkMessage<'_>, publisher: u16) -> Addressed {
         Announced::DataSetMetaData {
             meta_data, status, ..
         } => match status.0 & BAD {
-            0 => of_topic(MessageType::MetaData, meta_data.name).unwrap_or(hidden),
+            0 => of_topic(TopicMessageType::MetaData, meta_data.name).unwrap_or(hidden),
             _ => Addressed {
                 withdrawn: topic(meta_data.name),
                 ..hidden
             },
         },
         Announced::ActionMetaData(action) => {
-            of_topic(MessageType::ActionMetaData, action.request.name).unwrap_or(hidden)
+            of_topic(TopicMessageType::ActionMetaData, action.request.name).unwrap_or(hidden)
         }
-        Announced::ApplicationDescription { .. } => plain(MessageType::Application),
-        Announced::PublisherEndpoints { .. } => plain(MessageType::Endpoints),
-        Announced::ApplicationStatus { .. } => plain(MessageType::Status),
+        Announced::ApplicationDescription { .. } => plain(TopicMessageType::Application),
+        Announced::PublisherEndpoints { .. } => plain(TopicMessageType::Endpoints),
+        Announced::ApplicationStatus { .. } => plain(TopicMessageType::Status),
         Announced::PubSubConnections(_) | Announced::PubSubConnection { .. } => {
-            plain(MessageType::Connection)
+            plain(TopicMessageType::Connection)
         }
-        Announced::ActionResponder(_) => plain(MessageType::ActionResponder),
+        Announced::ActionResponder(_) => plain(TopicMessageType::ActionResponder),
         Announced::DataSetWriterConfiguration { .. } => hidden,
     }
 }
@@ -202,7 +202,7 @@ mod tests {
         } = addressed(&value(&[10])).address;
         assert_eq!(
             (kind, publisher, group, writer),
-            (MessageType::Data, 1, Some(2), Some(10))
+            (TopicMessageType::Data, 1, Some(2), Some(10))
         );
         assert_eq!(addressed(&value(&[10, 11])).address.writer, None);
     }
@@ -210,8 +210,8 @@ mod tests {
     #[test]
     fn metadata_has_the_topic_in_its_name_and_a_bad_status_withdraws_it() {
         for (status, kind) in [
-            (StatusCode::GOOD, MessageType::MetaData),
-            (StatusCode(0x803E_0000), MessageType::Discovery),
+            (StatusCode::GOOD, TopicMessageType::MetaData),
+            (StatusCode(0x803E_0000), TopicMessageType::Discovery),
         ] {
             let announcement = Announcement {
                 sequence_number: 1,
@@ -231,7 +231,7 @@ mod tests {
                 .unwrap();
             let Addressed { address, withdrawn } = addressed(&bytes);
             assert_eq!(address.kind, kind);
-            let is_withdrawn = kind == MessageType::Discovery;
+            let is_withdrawn = kind == TopicMessageType::Discovery;
             assert_eq!(withdrawn.is_some(), is_withdrawn);
             assert_eq!(address.writer.is_some(), !is_withdrawn);
         }

@@ -16,21 +16,21 @@ use uadp::discovery::ConnectionState;
 use uadp::{NetworkMessage, NetworkMessageType, Timestamp};
 
 use crate::address::{self, Addressed};
-use crate::connection::{Link, Shared, State, instant, run};
+use crate::connection::{BrokerLink, ConnectionShared, SharedState, instant, run};
 use crate::echo::Echo;
 use crate::json::Json;
-use crate::packets::Message;
+use crate::packets::ReceivedPublish;
 use crate::producers::Producers;
-use crate::queue::Publication;
+use crate::queue::QueuedPublish;
 use crate::reports::Reports;
-use crate::settings::{Identity, OpenError, Settings};
-use crate::topics::{self, Address, JSON, MessageType, UADP};
+use crate::settings::{BrokerSettings, Identity, OpenError};
+use crate::topics::{self, Address, JSON, TopicMessageType, UADP};
 
 /// A connection with an MQTT broker that carries the NetworkMessages of a program.
 pub struct Mqtt {
-    settings: Arc<Settings>,
-    shared: Arc<Shared>,
-    received: mpsc::Receiver<(Message, SocketAddr)>,
+    settings: Arc<BrokerSettings>,
+    shared: Arc<ConnectionShared>,
+    received: mpsc::Receiver<(ReceivedPublish, SocketAddr)>,
     /// Messages for the caller.
     ready: VecDeque<(Vec<u8>, SocketAddr)>,
     producers: Producers,
@@ -62,8 +62,8 @@ impl Mqtt {
     /// # Errors
     /// An [`OpenError`] if a file with certificates or the log-in cannot be used.
     pub fn open(broker: &Broker, identity: &Identity) -> Result<Self, OpenError> {
-        let settings = Arc::new(Settings::read(broker, identity)?);
-        let shared = Arc::new(Shared::default());
+        let settings = Arc::new(BrokerSettings::read(broker, identity)?);
+        let shared = Arc::new(ConnectionShared::default());
         let reports = Reports::new(settings.will.is_some());
         let (out, received) = mpsc::channel(MAX_RECEIVED);
         // The task ends when the carrier is closed or dropped.
@@ -96,11 +96,11 @@ impl Mqtt {
         topics::encoding(self.broker().encoding) == JSON
     }
 
-    fn publication(&self, encoding: &str, address: Address, payload: Vec<u8>) -> Publication {
+    fn publication(&self, encoding: &str, address: Address, payload: Vec<u8>) -> QueuedPublish {
         let retained = address.kind.is_retained();
         let broker = self.broker();
-        let is_value = address.kind == MessageType::Data;
-        Publication {
+        let is_value = address.kind == TopicMessageType::Data;
+        QueuedPublish {
             topic: topics::name(broker, encoding, address),
             payload,
             retained,
@@ -117,13 +117,13 @@ impl Mqtt {
     }
 
     /// Publishes a retained message now and with each connection.
-    fn keep(&mut self, publication: Publication) {
+    fn keep(&mut self, publication: QueuedPublish) {
         self.echo.sent(&publication.topic, &publication.payload);
         let mut state = self.shared.state();
-        let State {
+        let SharedState {
             queue, kept, link, ..
         } = &mut *state;
-        if matches!(link, Link::Connected { .. }) {
+        if matches!(link, BrokerLink::Connected { .. }) {
             // The message is published again later if the queue is full.
             let _full = queue.push(publication.clone(), instant()).is_err();
         }
@@ -145,7 +145,7 @@ impl Mqtt {
     fn clear(&self, topic: String) {
         let mut state = self.shared.state();
         state.kept.remove(&topic);
-        let cleared = Publication {
+        let cleared = QueuedPublish {
             topic,
             payload: Vec::new(),
             retained: true,
@@ -155,7 +155,7 @@ impl Mqtt {
             message_type: "",
             content_type: "",
         };
-        if matches!(state.link, Link::Connected { .. }) {
+        if matches!(state.link, BrokerLink::Connected { .. }) {
             // With MQTT 5 the message expires if it cannot be cleared.
             let _full = state.queue.push(cleared, instant()).is_err();
         }
@@ -166,7 +166,7 @@ impl Mqtt {
     /// Clears the discovery messages of a topic.
     fn withdraw(&self, topic: TopicId) {
         let (publisher, group, writer) = topic.triple();
-        for kind in [MessageType::MetaData, MessageType::ActionMetaData] {
+        for kind in [TopicMessageType::MetaData, TopicMessageType::ActionMetaData] {
             let address = Address {
                 kind,
                 publisher,
@@ -188,7 +188,7 @@ impl Mqtt {
     }
 
     /// Handles a received message, and queues the messages for the caller.
-    fn admit(&mut self, message: Message, from: SocketAddr) {
+    fn admit(&mut self, message: ReceivedPublish, from: SocketAddr) {
         match self.judge(&message, from) {
             Ok(true) => self.ready.push_back((message.payload, from)),
             Ok(false) => {}
@@ -197,8 +197,8 @@ impl Mqtt {
     }
 
     /// Returns whether a message is for the caller, or the reason why it is dropped.
-    fn judge(&mut self, message: &Message, from: SocketAddr) -> Result<bool, &'static str> {
-        let Message {
+    fn judge(&mut self, message: &ReceivedPublish, from: SocketAddr) -> Result<bool, &'static str> {
+        let ReceivedPublish {
             topic,
             payload,
             retained,
@@ -227,13 +227,13 @@ impl Mqtt {
             return Err("other_publisher");
         }
         let now = instant();
-        if kind == MessageType::Connection {
+        if kind == TopicMessageType::Connection {
             if *retained && self.settings.publisher == Some(publisher) {
                 self.reports.stray(topic, now);
             }
             return Ok(false);
         }
-        if kind == MessageType::Status {
+        if kind == TopicMessageType::Status {
             let status = address::status(&network).ok_or("malformed_status")?;
             let is_own = self.settings.publisher == Some(publisher);
             if is_own && status.0 != ConnectionState::OPERATIONAL {
@@ -247,7 +247,7 @@ impl Mqtt {
         if !retained {
             let released = self.producers.lives(publisher);
             self.release(released, from);
-            if kind == MessageType::MetaData {
+            if kind == TopicMessageType::MetaData {
                 self.json.learn(&network);
             }
             return Ok(true);
@@ -258,18 +258,18 @@ impl Mqtt {
     /// Judges a retained message, which may be old.
     fn judge_retained(
         &mut self,
-        message: &Message,
+        message: &ReceivedPublish,
         (network, address): (&NetworkMessage<'_>, Address),
     ) -> Result<bool, &'static str> {
         let Address {
             kind, publisher, ..
         } = address;
-        let Message { topic, payload, .. } = message;
+        let ReceivedPublish { topic, payload, .. } = message;
         let now = instant();
         if !kind.is_retained() {
             // A value that another stack retains. It counts only while its publisher runs, and its
             // age decides later.
-            let is_state = kind == MessageType::Data;
+            let is_state = kind == TopicMessageType::Data;
             let runs = self.producers.is_operational(publisher, now);
             return if is_state && runs {
                 Ok(true)
@@ -282,7 +282,7 @@ impl Mqtt {
             return Ok(false);
         }
         if self.producers.is_operational(publisher, now) {
-            if kind == MessageType::MetaData {
+            if kind == TopicMessageType::MetaData {
                 self.json.learn(network);
             }
             return Ok(true);
@@ -296,11 +296,11 @@ impl Mqtt {
     /// Judges a message of the JSON mapping, and queues its values as UADP.
     fn judge_json(
         &mut self,
-        message: &Message,
+        message: &ReceivedPublish,
         address: Address,
         from: SocketAddr,
     ) -> Result<bool, &'static str> {
-        let Message {
+        let ReceivedPublish {
             topic,
             payload,
             retained,
@@ -311,12 +311,12 @@ impl Mqtt {
         } = address;
         if !matches!(
             kind,
-            MessageType::Data | MessageType::MetaData | MessageType::Status
+            TopicMessageType::Data | TopicMessageType::MetaData | TopicMessageType::Status
         ) {
             return Err("other_topic");
         }
         let is_own = self.settings.publisher == Some(publisher);
-        if *retained && kind != MessageType::Status {
+        if *retained && kind != TopicMessageType::Status {
             let runs = self.producers.is_operational(publisher, now);
             match kind.is_retained() {
                 true if is_own => {
@@ -334,7 +334,7 @@ impl Mqtt {
             }
         }
         let reading = self.json.read(payload, address)?;
-        if reading.status.is_some() != (kind == MessageType::Status) {
+        if reading.status.is_some() != (kind == TopicMessageType::Status) {
             return Err("other_publisher");
         }
         for fault in reading.faults {
@@ -355,7 +355,7 @@ impl Mqtt {
     /// Handles the retained messages of an Operational publisher.
     fn release(&mut self, released: BTreeMap<String, Vec<u8>>, from: SocketAddr) {
         for (topic, payload) in released {
-            let message = Message {
+            let message = ReceivedPublish {
                 topic,
                 payload,
                 retained: false,
@@ -372,10 +372,10 @@ impl Mqtt {
             return;
         }
         let json = match (address.kind, address::status(network)) {
-            (MessageType::Status, Some(status)) => {
+            (TopicMessageType::Status, Some(status)) => {
                 Some(self.json.status(address.publisher, status, utc()))
             }
-            (MessageType::MetaData, _) => self.json.describe(network, utc()),
+            (TopicMessageType::MetaData, _) => self.json.describe(network, utc()),
             _ => None,
         };
         if let Some(json) = json {
@@ -387,7 +387,7 @@ impl Mqtt {
     /// Publishes the own status.
     fn announce_status(&mut self, publisher: u16, status: &[u8]) {
         if let Ok(network) = NetworkMessage::decode(status) {
-            self.announce(&network, alone(MessageType::Status, publisher));
+            self.announce(&network, alone(TopicMessageType::Status, publisher));
         }
     }
 
@@ -403,7 +403,7 @@ impl Mqtt {
         if publisher != 0
             && let Some(connection) = self.reports.connection(publisher, now)
         {
-            let address = alone(MessageType::Connection, publisher);
+            let address = alone(TopicMessageType::Connection, publisher);
             let publication = self.publication(UADP, address, connection);
             self.keep(publication);
         }
@@ -446,10 +446,13 @@ impl Carrier for Mqtt {
             return Ok(());
         }
         // A forwarded value is of another publisher.
-        if address.kind == MessageType::Data && self.settings.publisher == Some(address.publisher) {
+        if address.kind == TopicMessageType::Data
+            && self.settings.publisher == Some(address.publisher)
+        {
             self.reports.uses(address, instant());
         }
-        let is_json = address.kind == MessageType::Data && !message.command && self.writes_json();
+        let is_json =
+            address.kind == TopicMessageType::Data && !message.command && self.writes_json();
         let json = is_json.then(|| self.json.value(&network, utc())).flatten();
         let mut publication = match json {
             Some(json) => self.publication(JSON, address, json),
@@ -460,7 +463,7 @@ impl Carrier for Mqtt {
         // Commands are never queued for an absent reader.
         publication.confirmed &= message.replaceable;
         let mut state = self.shared.state();
-        let Link::Connected {
+        let BrokerLink::Connected {
             version,
             max_packet,
             ..
@@ -522,8 +525,10 @@ impl Carrier for Mqtt {
 
     fn lost(&self) -> Option<String> {
         match &self.shared.state().link {
-            Link::Connected { .. } => None,
-            Link::Waiting(why) => Some(format!("waiting for broker {}: {why}", self.interface())),
+            BrokerLink::Connected { .. } => None,
+            BrokerLink::Waiting(why) => {
+                Some(format!("waiting for broker {}: {why}", self.interface()))
+            }
         }
     }
 
@@ -548,11 +553,11 @@ impl Carrier for Mqtt {
 
     fn limit(&self) -> Option<usize> {
         match self.shared.state().link {
-            Link::Connected { max_packet, .. } => {
+            BrokerLink::Connected { max_packet, .. } => {
                 let most = usize::try_from(max_packet?).unwrap_or(usize::MAX);
                 Some(most.saturating_sub(self.broker().prefix.len() + OVERHEAD + LONGEST_TOPIC))
             }
-            Link::Waiting(_) => None,
+            BrokerLink::Waiting(_) => None,
         }
     }
 
@@ -573,7 +578,7 @@ impl Carrier for Mqtt {
         let status = self
             .settings
             .publisher
-            .map(|of| alone(MessageType::Status, of));
+            .map(|of| alone(TopicMessageType::Status, of));
         let stays: Vec<String> = [UADP, JSON]
             .into_iter()
             .filter_map(|encoding| Some(topics::name(self.broker(), encoding, status?)))
@@ -619,19 +624,19 @@ fn agrees(network: &NetworkMessage<'_>, address: Address) -> bool {
     let kind = address.kind;
     let is_call = matches!(
         kind,
-        MessageType::ActionRequest | MessageType::ActionResponse
+        TopicMessageType::ActionRequest | TopicMessageType::ActionResponse
     );
     match network.message_type() {
-        NetworkMessageType::Probe => return kind == MessageType::Probe,
+        NetworkMessageType::Probe => return kind == TopicMessageType::Probe,
         NetworkMessageType::Announcement => {
-            return !is_call && !matches!(kind, MessageType::Data | MessageType::Probe);
+            return !is_call && !matches!(kind, TopicMessageType::Data | TopicMessageType::Probe);
         }
         NetworkMessageType::DataSet => {}
     }
     let found = address::of(network, None).map(|of| of.address.kind);
     // A sealed message or a chunk does not show whether it is a request or a response.
     let is_hidden = is_call && (network.is_sealed() || network.is_chunk());
-    if found != Some(kind) && !(is_hidden && found == Some(MessageType::ActionRequest)) {
+    if found != Some(kind) && !(is_hidden && found == Some(TopicMessageType::ActionRequest)) {
         return false;
     }
     let group = network.group().and_then(|group| group.writer_group_id);
@@ -645,7 +650,7 @@ fn agrees(network: &NetworkMessage<'_>, address: Address) -> bool {
     is_group && is_writer
 }
 
-const fn alone(kind: MessageType, publisher: u16) -> Address {
+const fn alone(kind: TopicMessageType, publisher: u16) -> Address {
     Address {
         kind,
         publisher,
@@ -655,20 +660,20 @@ const fn alone(kind: MessageType, publisher: u16) -> Address {
 }
 
 /// Returns the value of the user property `UAMessageType`.
-const fn message_type(kind: MessageType) -> &'static str {
+const fn message_type(kind: TopicMessageType) -> &'static str {
     match kind {
-        MessageType::Data => "ua-data",
-        MessageType::MetaData => "ua-metadata",
-        MessageType::Status => "ua-status",
-        MessageType::Connection => "ua-connection",
-        MessageType::Application => "ua-application",
-        MessageType::Endpoints => "ua-endpoints",
-        MessageType::ActionRequest => "ua-action-request",
-        MessageType::ActionResponse => "ua-action-response",
-        MessageType::ActionMetaData => "ua-action-metadata",
-        MessageType::ActionResponder => "ua-action-responder",
-        MessageType::Discovery => "ua-discovery",
-        MessageType::Probe => "ua-probe",
+        TopicMessageType::Data => "ua-data",
+        TopicMessageType::MetaData => "ua-metadata",
+        TopicMessageType::Status => "ua-status",
+        TopicMessageType::Connection => "ua-connection",
+        TopicMessageType::Application => "ua-application",
+        TopicMessageType::Endpoints => "ua-endpoints",
+        TopicMessageType::ActionRequest => "ua-action-request",
+        TopicMessageType::ActionResponse => "ua-action-response",
+        TopicMessageType::ActionMetaData => "ua-action-metadata",
+        TopicMessageType::ActionResponder => "ua-action-responder",
+        TopicMessageType::Discovery => "ua-discovery",
+        TopicMessageType::Probe => "ua-probe",
     }
 }
 
@@ -715,14 +720,14 @@ mod tests {
         message.keep_alive(&DataSetHeader::default()).unwrap();
         message.finish().unwrap();
         let message = NetworkMessage::decode(&bytes).unwrap();
-        for kind in MessageType::ALL {
+        for kind in TopicMessageType::ALL {
             let address = Address {
                 kind,
                 publisher: 1,
                 group: Some(2),
                 writer: Some(10),
             };
-            let is_data = kind == MessageType::Data;
+            let is_data = kind == TopicMessageType::Data;
             assert_eq!(agrees(&message, address), is_data, "{kind:?}");
             let other = Address {
                 writer: Some(11),

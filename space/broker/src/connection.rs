@@ -17,29 +17,29 @@ use tokio::sync::{Notify, mpsc};
 use tokio::time::{Instant as TokioInstant, sleep, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
-use crate::packets::{self, Accepted, Event, Message};
-use crate::queue::{Publication, Queue};
-use crate::settings::{Settings, random};
-use crate::stream::{Stream, connect};
+use crate::packets::{self, ConnectAck, PacketEvent, ReceivedPublish};
+use crate::queue::{QueuedPublish, SendQueue};
+use crate::settings::{BrokerSettings, random};
+use crate::stream::{BrokerStream, connect};
 use crate::topics;
 
 /// The state that the task shares with the carrier.
 #[derive(Debug, Default)]
-pub(crate) struct Shared {
-    state: Mutex<State>,
+pub(crate) struct ConnectionShared {
+    state: Mutex<SharedState>,
     /// Wakes the task, because the queue has messages or the connection is to be closed.
     wake: Notify,
 }
 
 #[derive(Debug, Default)]
-pub(crate) struct State {
-    pub(crate) queue: Queue,
-    pub(crate) link: Link,
+pub(crate) struct SharedState {
+    pub(crate) queue: SendQueue,
+    pub(crate) link: BrokerLink,
     /// Number of connections so far.
     pub(crate) connections: u64,
     /// The retained messages by topic. They are published again with each connection, because a
     /// broker may lose them.
-    pub(crate) kept: BTreeMap<String, Publication>,
+    pub(crate) kept: BTreeMap<String, QueuedPublish>,
     /// Number of received messages that were dropped because the program is too slow.
     pub(crate) overflow: u64,
     closing: bool,
@@ -48,7 +48,7 @@ pub(crate) struct State {
 
 /// The state of the connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Link {
+pub(crate) enum BrokerLink {
     /// There is no connection, for this reason.
     Waiting(String),
     /// The broker accepted the connection.
@@ -60,15 +60,15 @@ pub(crate) enum Link {
     },
 }
 
-impl Default for Link {
+impl Default for BrokerLink {
     fn default() -> Self {
         Self::Waiting("not connected yet".to_owned())
     }
 }
 
-impl Shared {
+impl ConnectionShared {
     /// Returns the state. It stays consistent if a holder of the lock panics.
-    pub(crate) fn state(&self) -> MutexGuard<'_, State> {
+    pub(crate) fn state(&self) -> MutexGuard<'_, SharedState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -87,14 +87,14 @@ impl Shared {
     fn waits(&self, why: &str) -> bool {
         let mut state = self.state();
         state.queue.discard();
-        state.link = Link::Waiting(why.to_owned());
+        state.link = BrokerLink::Waiting(why.to_owned());
         !state.closing
     }
 
     /// Records that the connection is closed.
     fn closed(&self) {
         let mut state = self.state();
-        state.link = Link::Waiting("closed".to_owned());
+        state.link = BrokerLink::Waiting("closed".to_owned());
         state.closed = true;
     }
 
@@ -111,9 +111,9 @@ enum Ended {
 
 /// Runs the connection until it is closed.
 pub(crate) async fn run(
-    settings: Arc<Settings>,
-    shared: Arc<Shared>,
-    received: mpsc::Sender<(Message, SocketAddr)>,
+    settings: Arc<BrokerSettings>,
+    shared: Arc<ConnectionShared>,
+    received: mpsc::Sender<(ReceivedPublish, SocketAddr)>,
 ) {
     let mut pause = FIRST_PAUSE;
     let mut version = settings.broker.version.unwrap_or(MqttVersion::V5);
@@ -150,8 +150,8 @@ pub(crate) async fn run(
 
 /// A connection with the broker, from its start to its end.
 struct Session<'a> {
-    settings: &'a Settings,
-    shared: &'a Shared,
+    settings: &'a BrokerSettings,
+    shared: &'a ConnectionShared,
     version: MqttVersion,
     protocol: mqtt::Connection<mqtt::role::Client>,
     /// Bytes to write, and the number of them that are written.
@@ -166,11 +166,15 @@ struct Session<'a> {
     at: SocketAddr,
     refuses_version: bool,
     over: Option<String>,
-    messages: Vec<Message>,
+    messages: Vec<ReceivedPublish>,
 }
 
 impl<'a> Session<'a> {
-    fn new(settings: &'a Settings, shared: &'a Shared, version: MqttVersion) -> Self {
+    fn new(
+        settings: &'a BrokerSettings,
+        shared: &'a ConnectionShared,
+        version: MqttVersion,
+    ) -> Self {
         let protocol_version = match version {
             MqttVersion::V3_1_1 => mqtt::Version::V3_1_1,
             MqttVersion::V5 => mqtt::Version::V5_0,
@@ -198,7 +202,7 @@ impl<'a> Session<'a> {
         }
     }
 
-    async fn run(&mut self, received: &mpsc::Sender<(Message, SocketAddr)>) -> Ended {
+    async fn run(&mut self, received: &mpsc::Sender<(ReceivedPublish, SocketAddr)>) -> Ended {
         let connected = tokio::select! {
             connected = connect(self.settings) => connected,
             () = self.closing() => return Ended::Closed,
@@ -235,8 +239,8 @@ impl<'a> Session<'a> {
     /// Exchanges packets until the connection ends.
     async fn exchange(
         &mut self,
-        stream: &mut Box<dyn Stream>,
-        received: &mpsc::Sender<(Message, SocketAddr)>,
+        stream: &mut Box<dyn BrokerStream>,
+        received: &mpsc::Sender<(ReceivedPublish, SocketAddr)>,
         accepted: TokioInstant,
     ) -> Ended {
         let (mut reader, mut writer) = tokio::io::split(stream);
@@ -297,7 +301,7 @@ impl<'a> Session<'a> {
     }
 
     fn is_connected(&self) -> bool {
-        matches!(self.shared.state().link, Link::Connected { .. })
+        matches!(self.shared.state().link, BrokerLink::Connected { .. })
     }
 
     fn written(&mut self, length: usize) {
@@ -332,7 +336,7 @@ impl<'a> Session<'a> {
         false
     }
 
-    fn publish(&mut self, publication: Publication) {
+    fn publish(&mut self, publication: QueuedPublish) {
         let id = match publication.confirmed {
             true => match self.protocol.acquire_packet_id() {
                 Ok(id) => {
@@ -434,21 +438,21 @@ impl<'a> Session<'a> {
 
     fn packet(&mut self, packet: Packet) {
         match packets::event(packet) {
-            Event::Accepted(accepted) => self.accepted(accepted),
-            Event::Refused { why, version } => {
+            PacketEvent::Accepted(accepted) => self.accepted(accepted),
+            PacketEvent::Refused { why, version } => {
                 self.refuses_version = version;
                 self.over = Some(why);
             }
-            Event::Message(message) => self.messages.push(message),
-            Event::NotSubscribed => warn!(
+            PacketEvent::Message(message) => self.messages.push(message),
+            PacketEvent::NotSubscribed => warn!(
                 "the broker refuses a subscription: allow the client to read the topics of its prefix"
             ),
-            Event::Ended(why) => self.over = Some(why),
-            Event::Other => {}
+            PacketEvent::Ended(why) => self.over = Some(why),
+            PacketEvent::Other => {}
         }
     }
 
-    fn accepted(&mut self, Accepted { max_packet }: Accepted) {
+    fn accepted(&mut self, ConnectAck { max_packet }: ConnectAck) {
         let broker = &self.settings.broker;
         for filter in topics::filters(broker) {
             let Ok(id) = self.protocol.acquire_packet_id() else {
@@ -463,12 +467,12 @@ impl<'a> Session<'a> {
         state.connections += 1;
         state.queue.discard();
         let now = instant();
-        let State { queue, kept, .. } = &mut *state;
+        let SharedState { queue, kept, .. } = &mut *state;
         for publication in kept.values() {
             // The queue is empty, and what does not fit is published again later.
             let _full = queue.push(publication.clone(), now).is_err();
         }
-        state.link = Link::Connected {
+        state.link = BrokerLink::Connected {
             at: self.at,
             version: self.version,
             max_packet,
@@ -477,7 +481,7 @@ impl<'a> Session<'a> {
     }
 
     /// Ends the session in order: the broker discards the will, and everything written arrives.
-    async fn finish(&mut self, stream: &mut Box<dyn Stream>) {
+    async fn finish(&mut self, stream: &mut Box<dyn BrokerStream>) {
         if let Ok(packet) = packets::disconnect(self.version) {
             self.send(packet);
         }

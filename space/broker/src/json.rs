@@ -18,7 +18,7 @@ use serde_json::{Map, Value, json};
 use uadp::discovery::{ConnectionState, CyclicStatus};
 use uadp::{DataSetMessage, MessageKind, NetworkMessage, StatusCode, Timestamp, Variant};
 
-use descriptions::{Descriptions, Field, Triple};
+use descriptions::{DataSetField, Descriptions, WriterIds};
 
 /// The converter of a program.
 #[derive(Debug)]
@@ -150,7 +150,7 @@ impl Json {
     }
 
     /// Returns a field of the payload.
-    fn field(&self, variant: &Variant<'_>, field: Option<&Field>) -> Option<Value> {
+    fn field(&self, variant: &Variant<'_>, field: Option<&DataSetField>) -> Option<Value> {
         let shown = json_values::show_variant(variant).ok()?;
         let is_described = field.is_some_and(|field| {
             field.builtin.is_some() && field.builtin == variant.builtin_type()

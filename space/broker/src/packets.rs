@@ -8,12 +8,12 @@ use mqtt_protocol_core::mqtt::packet::{
 };
 use mqtt_protocol_core::mqtt::result_code::MqttError;
 
-use crate::queue::Publication;
-use crate::settings::{Settings, Will};
+use crate::queue::QueuedPublish;
+use crate::settings::{BrokerSettings, Will};
 
 /// A received publication.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Message {
+pub(crate) struct ReceivedPublish {
     pub(crate) topic: String,
     pub(crate) payload: Vec<u8>,
     pub(crate) retained: bool,
@@ -21,13 +21,16 @@ pub(crate) struct Message {
 
 /// The response of a broker to a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Accepted {
+pub(crate) struct ConnectAck {
     /// The largest packet that the broker takes.
     pub(crate) max_packet: Option<u32>,
 }
 
 /// Returns the packet that opens a session without stored state.
-pub(crate) fn connect(settings: &Settings, version: MqttVersion) -> Result<Packet, MqttError> {
+pub(crate) fn connect(
+    settings: &BrokerSettings,
+    version: MqttVersion,
+) -> Result<Packet, MqttError> {
     let id = settings.client_id.as_str();
     let login = settings.credentials.as_ref();
     Ok(match version {
@@ -94,14 +97,14 @@ pub(crate) fn subscribe(
 
 /// Returns the packet of a publication. `id` is set for a publication that is confirmed.
 pub(crate) fn publish(
-    publication: Publication,
+    publication: QueuedPublish,
     (version, id): (MqttVersion, Option<u16>),
 ) -> Result<Packet, MqttError> {
     let qos = match id {
         Some(_) => Qos::AtLeastOnce,
         None => Qos::AtMostOnce,
     };
-    let Publication {
+    let QueuedPublish {
         topic,
         payload,
         retained,
@@ -169,13 +172,13 @@ pub(crate) fn ping(version: MqttVersion) -> Result<Packet, MqttError> {
 }
 
 /// A packet of interest.
-pub(crate) enum Event {
-    Accepted(Accepted),
+pub(crate) enum PacketEvent {
+    Accepted(ConnectAck),
     Refused {
         why: String,
         version: bool,
     },
-    Message(Message),
+    Message(ReceivedPublish),
     /// The broker refused a subscription.
     NotSubscribed,
     Ended(String),
@@ -187,14 +190,14 @@ pub(crate) enum Event {
     clippy::wildcard_enum_match_arm,
     reason = "acknowledgements and packets of brokers are handled by the protocol library"
 )]
-pub(crate) fn event(packet: Packet) -> Event {
+pub(crate) fn event(packet: Packet) -> PacketEvent {
     match packet {
         Packet::V3_1_1Connack(packet) => {
             let code = packet.return_code();
             let version = code == mqtt::result_code::ConnectReturnCode::UnacceptableProtocolVersion;
             match code.is_success() {
-                true => Event::Accepted(Accepted { max_packet: None }),
-                false => Event::Refused {
+                true => PacketEvent::Accepted(ConnectAck { max_packet: None }),
+                false => PacketEvent::Refused {
                     why: format!("the broker refuses the connection: {code:?}"),
                     version,
                 },
@@ -204,45 +207,45 @@ pub(crate) fn event(packet: Packet) -> Event {
             let code = packet.reason_code();
             let version = code == mqtt::result_code::ConnectReasonCode::UnsupportedProtocolVersion;
             match code == mqtt::result_code::ConnectReasonCode::Success {
-                true => Event::Accepted(Accepted {
+                true => PacketEvent::Accepted(ConnectAck {
                     max_packet: packet.props().iter().find_map(|property| match property {
                         Property::MaximumPacketSize(size) => Some(size.val()),
                         _ => None,
                     }),
                 }),
-                false => Event::Refused {
+                false => PacketEvent::Refused {
                     why: format!("the broker refuses the connection: {code:?}"),
                     version,
                 },
             }
         }
-        Packet::V3_1_1Publish(packet) => Event::Message(Message {
+        Packet::V3_1_1Publish(packet) => PacketEvent::Message(ReceivedPublish {
             topic: packet.topic_name().to_owned(),
             payload: packet.payload().as_slice().to_vec(),
             retained: packet.retain(),
         }),
-        Packet::V5_0Publish(packet) => Event::Message(Message {
+        Packet::V5_0Publish(packet) => PacketEvent::Message(ReceivedPublish {
             topic: packet.topic_name().to_owned(),
             payload: packet.payload().as_slice().to_vec(),
             retained: packet.retain(),
         }),
         Packet::V3_1_1Suback(packet) => {
             match packet.return_codes().iter().all(|code| code.is_success()) {
-                true => Event::Other,
-                false => Event::NotSubscribed,
+                true => PacketEvent::Other,
+                false => PacketEvent::NotSubscribed,
             }
         }
         Packet::V5_0Suback(packet) => {
             match packet.reason_codes().iter().all(|code| code.is_success()) {
-                true => Event::Other,
-                false => Event::NotSubscribed,
+                true => PacketEvent::Other,
+                false => PacketEvent::NotSubscribed,
             }
         }
-        Packet::V5_0Disconnect(packet) => Event::Ended(format!(
+        Packet::V5_0Disconnect(packet) => PacketEvent::Ended(format!(
             "the broker ended the connection: {:?}",
             packet.reason_code()
         )),
-        _ => Event::Other,
+        _ => PacketEvent::Other,
     }
 }
 

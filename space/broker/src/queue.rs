@@ -7,7 +7,7 @@ use transport::SendError;
 
 /// A message to publish.
 #[derive(Debug, Clone)]
-pub(crate) struct Publication {
+pub(crate) struct QueuedPublish {
     pub(crate) topic: String,
     pub(crate) payload: Vec<u8>,
     pub(crate) retained: bool,
@@ -24,12 +24,12 @@ pub(crate) struct Publication {
 }
 
 /// A message and the time at which it expires.
-pub(crate) type Waiting = (Publication, Option<Instant>);
+pub(crate) type QueuedMessage = (QueuedPublish, Option<Instant>);
 
 /// A bounded queue. Messages leave it in their order, unless they have expired.
 #[derive(Debug, Default)]
-pub(crate) struct Queue {
-    waiting: VecDeque<Waiting>,
+pub(crate) struct SendQueue {
+    waiting: VecDeque<QueuedMessage>,
     bytes: usize,
     /// Number of messages that expired or were replaced, or that a lost connection discarded.
     pub(crate) expired: u64,
@@ -37,8 +37,12 @@ pub(crate) struct Queue {
     pub(crate) discarded: u64,
 }
 
-impl Queue {
-    pub(crate) fn push(&mut self, publication: Publication, now: Instant) -> Result<(), SendError> {
+impl SendQueue {
+    pub(crate) fn push(
+        &mut self,
+        publication: QueuedPublish,
+        now: Instant,
+    ) -> Result<(), SendError> {
         let until = publication.within.map(|within| now + within);
         if publication.replaceable
             && let Some((older, of)) = self
@@ -61,7 +65,7 @@ impl Queue {
     }
 
     /// Returns the next message that has not expired.
-    pub(crate) fn pop(&mut self, now: Instant) -> Option<Waiting> {
+    pub(crate) fn pop(&mut self, now: Instant) -> Option<QueuedMessage> {
         while let Some((publication, until)) = self.waiting.pop_front() {
             self.bytes = self.bytes.saturating_sub(publication.payload.len());
             if until.is_none_or(|until| now <= until) {
@@ -73,7 +77,7 @@ impl Queue {
     }
 
     /// Returns the next message to its place, because the broker confirms too slowly.
-    pub(crate) fn unpop(&mut self, waiting: Waiting) {
+    pub(crate) fn unpop(&mut self, waiting: QueuedMessage) {
         self.bytes += waiting.0.payload.len();
         self.waiting.push_front(waiting);
     }
@@ -93,8 +97,8 @@ const MAX_BYTES: usize = 64 << 20;
 mod tests {
     use super::*;
 
-    fn publication(topic: &str, within: Option<u64>, replaceable: bool) -> Publication {
-        Publication {
+    fn publication(topic: &str, within: Option<u64>, replaceable: bool) -> QueuedPublish {
+        QueuedPublish {
             topic: topic.to_owned(),
             payload: vec![0; 10],
             retained: false,
@@ -113,7 +117,7 @@ mod tests {
 
     #[test]
     fn a_command_that_waits_too_long_is_not_sent() {
-        let mut queue = Queue::default();
+        let mut queue = SendQueue::default();
         let start = start();
         queue
             .push(publication("stop", Some(1000), false), start)
@@ -128,7 +132,7 @@ mod tests {
 
     #[test]
     fn a_state_replaces_the_waiting_state_of_its_topic_only() {
-        let mut queue = Queue::default();
+        let mut queue = SendQueue::default();
         let start = start();
         for topic in ["a", "b", "a"] {
             queue.push(publication(topic, None, true), start).unwrap();
@@ -142,7 +146,7 @@ mod tests {
 
     #[test]
     fn a_full_queue_refuses_messages_and_a_lost_connection_empties_it() {
-        let mut queue = Queue::default();
+        let mut queue = SendQueue::default();
         let start = start();
         for _ in 0..MAX_WAITING {
             queue.push(publication("a", None, false), start).unwrap();

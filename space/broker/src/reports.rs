@@ -208,7 +208,7 @@ mod tests {
     use uadp::NetworkMessage;
 
     use super::*;
-    use crate::topics::MessageType;
+    use crate::topics::TopicMessageType;
 
     #[test]
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
@@ -235,7 +235,7 @@ mod tests {
         assert_eq!(reports.connection(1, now), None);
         for writer in [11, 10, 11] {
             let address = Address {
-                kind: MessageType::Data,
+                kind: TopicMessageType::Data,
                 publisher: 1,
                 group: Some(2),
                 writer: Some(writer),

@@ -54,7 +54,7 @@ pub enum OpenError {
 }
 
 /// The settings of a connection.
-pub(crate) struct Settings {
+pub(crate) struct BrokerSettings {
     pub(crate) broker: Broker,
     pub(crate) client_id: String,
     pub(crate) publisher: Option<u16>,
@@ -81,7 +81,7 @@ pub(crate) struct Tls {
     pub(crate) host: ServerName<'static>,
 }
 
-impl Settings {
+impl BrokerSettings {
     pub(crate) fn read(broker: &Broker, identity: &Identity) -> Result<Self, OpenError> {
         let credentials = broker.credentials.as_deref().map(credentials).transpose()?;
         let tls = broker.address.tls.then(|| tls(broker)).transpose()?;

@@ -9,15 +9,17 @@ use tokio::net::{TcpStream, lookup_host};
 use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 
-use crate::settings::Settings;
+use crate::settings::BrokerSettings;
 
 /// A connection with a broker.
-pub(crate) trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
+pub(crate) trait BrokerStream: AsyncRead + AsyncWrite + Unpin + Send {}
 
-impl<T: AsyncRead + AsyncWrite + Unpin + Send> Stream for T {}
+impl<T: AsyncRead + AsyncWrite + Unpin + Send> BrokerStream for T {}
 
 /// Connects with the broker, and returns its address.
-pub(crate) async fn connect(settings: &Settings) -> io::Result<(Box<dyn Stream>, SocketAddr)> {
+pub(crate) async fn connect(
+    settings: &BrokerSettings,
+) -> io::Result<(Box<dyn BrokerStream>, SocketAddr)> {
     match timeout(CONNECT, connect_now(settings)).await {
         Ok(connected) => connected,
         Err(_elapsed) => Err(io::Error::new(
@@ -27,7 +29,7 @@ pub(crate) async fn connect(settings: &Settings) -> io::Result<(Box<dyn Stream>,
     }
 }
 
-async fn connect_now(settings: &Settings) -> io::Result<(Box<dyn Stream>, SocketAddr)> {
+async fn connect_now(settings: &BrokerSettings) -> io::Result<(Box<dyn BrokerStream>, SocketAddr)> {
     let address = &settings.broker.address;
     let mut failed = None;
     for at in lookup_host((address.host.as_str(), address.port)).await? {
@@ -40,7 +42,7 @@ async fn connect_now(settings: &Settings) -> io::Result<(Box<dyn Stream>, Socket
         .unwrap_or_else(|| io::Error::new(io::ErrorKind::NotFound, "the host has no address")))
 }
 
-async fn secure(settings: &Settings, tcp: TcpStream) -> io::Result<Box<dyn Stream>> {
+async fn secure(settings: &BrokerSettings, tcp: TcpStream) -> io::Result<Box<dyn BrokerStream>> {
     tcp.set_nodelay(true)?;
     // On close, the system discards data that was not sent, and resets the connection, so that the
     // broker discards data that it has not read: nothing of it is delivered late. A connection that

@@ -6,7 +6,7 @@ use mappings::{Broker, MessageMapping, TopicForm, TopicId};
 
 /// The type of a message, the third level of its topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(crate) enum MessageType {
+pub(crate) enum TopicMessageType {
     Data,
     MetaData,
     Status,
@@ -24,7 +24,7 @@ pub(crate) enum MessageType {
     Probe,
 }
 
-impl MessageType {
+impl TopicMessageType {
     pub(crate) const ALL: [Self; 12] = [
         // The status of a publisher is subscribed first, because it decides about the rest.
         Self::Status,
@@ -80,7 +80,7 @@ impl MessageType {
 /// The ids in the topic of a message. A topic without a writer holds messages of several writers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct Address {
-    pub(crate) kind: MessageType,
+    pub(crate) kind: TopicMessageType,
     pub(crate) publisher: u16,
     pub(crate) group: Option<u16>,
     pub(crate) writer: Option<u16>,
@@ -116,7 +116,7 @@ pub(crate) fn name(broker: &Broker, encoding: &str, address: Address) -> String 
         writer,
     } = address;
     let prefix = &broker.prefix;
-    if let (TopicForm::Names, MessageType::Data, Some(group), Some(writer)) =
+    if let (TopicForm::Names, TopicMessageType::Data, Some(group), Some(writer)) =
         (broker.topics, kind, group, writer)
     {
         return format!("{prefix}/ua_{publisher}_{group}_{writer}");
@@ -138,7 +138,7 @@ pub(crate) fn parse(broker: &Broker, topic: &str) -> Option<ReceivedTopic> {
             // Commands and sealed values are always UADP; JSON is known by its first byte.
             is_json: false,
             address: Address {
-                kind: MessageType::Data,
+                kind: TopicMessageType::Data,
                 publisher,
                 group: Some(group),
                 writer: Some(writer),
@@ -152,7 +152,9 @@ pub(crate) fn parse(broker: &Broker, topic: &str) -> Option<ReceivedTopic> {
         _ => return None,
     };
     let kind = levels.next()?;
-    let kind = MessageType::ALL.into_iter().find(|of| of.level() == kind)?;
+    let kind = TopicMessageType::ALL
+        .into_iter()
+        .find(|of| of.level() == kind)?;
     let publisher = number(levels.next()?)?;
     let group = levels.next().map(number);
     let writer = levels.next().map(number);
@@ -171,7 +173,7 @@ pub(crate) fn parse(broker: &Broker, topic: &str) -> Option<ReceivedTopic> {
 /// Returns the filters of all messages of the space, in the order of subscription.
 pub(crate) fn filters(broker: &Broker) -> Vec<String> {
     let prefix = &broker.prefix;
-    let mut filters: Vec<String> = MessageType::ALL
+    let mut filters: Vec<String> = TopicMessageType::ALL
         .into_iter()
         .flat_map(|kind| {
             [UADP, JSON].map(|encoding| format!("{prefix}/{encoding}/{}/#", kind.level()))
@@ -202,7 +204,7 @@ mod tests {
     }
 
     const VALUE: Address = Address {
-        kind: MessageType::Data,
+        kind: TopicMessageType::Data,
         publisher: 1,
         group: Some(2),
         writer: Some(10),
@@ -215,7 +217,7 @@ mod tests {
         let names = broker(TopicForm::Names);
         assert_eq!(name(&names, UADP, VALUE), "opcua/ua_1_2_10");
         let status = Address {
-            kind: MessageType::Status,
+            kind: TopicMessageType::Status,
             publisher: 1,
             group: None,
             writer: None,
@@ -227,7 +229,7 @@ mod tests {
     fn every_topic_is_read_as_it_was_written() {
         for form in [TopicForm::Tree, TopicForm::Names] {
             let broker = broker(form);
-            for kind in MessageType::ALL {
+            for kind in TopicMessageType::ALL {
                 let address = Address { kind, ..VALUE };
                 let read = parse(&broker, &name(&broker, UADP, address)).unwrap();
                 assert_eq!(read.address, address);

@@ -7,7 +7,7 @@ use super::Registry;
 use crate::asked::{Asked, RegisterFault};
 use crate::loss::Loss;
 use crate::network::{Announcement, host, place};
-use crate::share::{Entry, Newcomer, Verdict, admit};
+use crate::share::{AdmissionVerdict, Newcomer, ShareEntry, admit};
 
 impl Registry {
     /// Makes space for a server that is not registered. An unverified registration may be
@@ -29,10 +29,10 @@ impl Registry {
             place: &place,
             sender,
         };
-        let entries: Vec<Entry<'_>> = self
+        let entries: Vec<ShareEntry<'_>> = self
             .servers
             .values()
-            .map(|server| Entry {
+            .map(|server| ShareEntry {
                 key: &server.asked.server_uri,
                 place: &server.place,
                 sender: &server.sender,
@@ -42,13 +42,13 @@ impl Registry {
             })
             .collect();
         match admit(&entries, &newcomer, most, now) {
-            Verdict::Room => Ok(()),
-            Verdict::InsteadOf(uri) => {
+            AdmissionVerdict::Room => Ok(()),
+            AdmissionVerdict::InsteadOf(uri) => {
                 self.displaced += 1;
                 self.end(&uri, Loss::Displaced);
                 Ok(())
             }
-            Verdict::Full => {
+            AdmissionVerdict::Full => {
                 self.refused += 1;
                 Err(RegisterFault::Full { most })
             }
@@ -79,12 +79,12 @@ impl Registry {
             .flat_map(|server| &server.asked.discovery_urls)
             .map(|url| url.trim_end_matches('/'))
             .collect();
-        let entries: Vec<Entry<'_>> = self
+        let entries: Vec<ShareEntry<'_>> = self
             .network
             .arrivals()
             .map(|(record, arrival)| {
                 let Announcement { instance, url, .. } = &record.announcement;
-                Entry {
+                ShareEntry {
                     key: instance,
                     place: &arrival.place,
                     sender: host(&arrival.place),
@@ -95,13 +95,13 @@ impl Registry {
             })
             .collect();
         match admit(&entries, &newcomer, self.settings.most, now) {
-            Verdict::Room => true,
-            Verdict::InsteadOf(instance) => {
+            AdmissionVerdict::Room => true,
+            AdmissionVerdict::InsteadOf(instance) => {
                 self.displaced += 1;
                 self.vanish(&instance, Loss::Displaced);
                 true
             }
-            Verdict::Full => {
+            AdmissionVerdict::Full => {
                 self.refused += 1;
                 false
             }

@@ -3,7 +3,7 @@
 use oxrdf::{BlankNode, Literal, NamedNode, NamedOrBlankNode, Term};
 
 use super::{Reading, Scope, TermNode, named};
-use crate::mapping::{Expression, Part, TermKind, TermMap, TermValue};
+use crate::mapping::{Expression, TemplatePart, TermKind, TermMap, TermValue};
 use crate::xpath::{Namespaces, parse};
 
 impl<'a> Reading<'a> {
@@ -66,11 +66,11 @@ impl<'a> Reading<'a> {
         };
         self.known_only(scope.map, node, &format!("the {role} map"), known(role));
         if role != "subject" && !self.graph.all(node, "class").is_empty() {
-            let what = format!(
+            let problem = format!(
                 "`class` belongs to a subject map, and is ignored in the {role} map; give the \
                  class in a triples map for these resources"
             );
-            self.note(scope.map, &what);
+            self.note(scope.map, &problem);
         }
         if let Some(term) = self.graph.one(node, "constant")? {
             return constant(term, role);
@@ -174,7 +174,7 @@ impl<'a> Reading<'a> {
 impl Expression {
     fn of(text: &str) -> Self {
         Self {
-            parts: vec![Part::Text(text.to_owned())],
+            parts: vec![TemplatePart::Text(text.to_owned())],
             is_template: false,
             written: text.to_owned(),
         }
@@ -184,7 +184,7 @@ impl Expression {
     pub(crate) fn constant(&self) -> Option<&str> {
         match self.parts.as_slice() {
             [] => Some(""),
-            [Part::Text(text)] => Some(text),
+            [TemplatePart::Text(text)] => Some(text),
             _ => None,
         }
     }
@@ -214,9 +214,9 @@ fn constant(term: &Term, role: &str) -> Result<TermMap, String> {
 
 fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, String> {
     let expr =
-        parse(written, namespaces).map_err(|what| format!("the reference `{written}`: {what}"))?;
+        parse(written, namespaces).map_err(|problem| format!("the reference `{written}`: {problem}"))?;
     Ok(Expression {
-        parts: vec![Part::Value(expr)],
+        parts: vec![TemplatePart::Value(expr)],
         is_template: false,
         written: written.to_owned(),
     })
@@ -224,7 +224,7 @@ fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, Strin
 
 /// Reads a template: texts with expressions in braces. A backslash escapes a brace.
 fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, String> {
-    let fault = |what: String| format!("the template `{written}`: {what}");
+    let fault = |problem: String| format!("the template `{written}`: {problem}");
     let mut parts = Vec::new();
     let mut text = String::new();
     let mut inner: Option<String> = None;
@@ -240,14 +240,14 @@ fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, String
         match (character, is_escaped, &mut inner) {
             ('{', false, None) => {
                 if !text.is_empty() {
-                    parts.push(Part::Text(std::mem::take(&mut text)));
+                    parts.push(TemplatePart::Text(std::mem::take(&mut text)));
                 }
                 inner = Some(String::new());
             }
             ('}', false, Some(expression)) => {
                 let expr = parse(expression, namespaces)
-                    .map_err(|what| fault(format!("`{expression}`: {what}")))?;
-                parts.push(Part::Value(expr));
+                    .map_err(|problem| fault(format!("`{expression}`: {problem}")))?;
+                parts.push(TemplatePart::Value(expr));
                 inner = None;
             }
             ('{' | '}', false, _) => {
@@ -263,7 +263,7 @@ fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, String
         return Err(fault("`{` has no counterpart".to_owned()));
     }
     if !text.is_empty() {
-        parts.push(Part::Text(text));
+        parts.push(TemplatePart::Text(text));
     }
     Ok(Expression {
         parts,

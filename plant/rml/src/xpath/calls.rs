@@ -2,7 +2,7 @@
 
 use roxmltree::NodeId;
 
-use super::evaluate::{Context, Evaluated, Evaluator, NodeRef, Value, Work};
+use super::evaluate::{Evaluated, Evaluator, NodeRef, WorkBudget, XPathContext, XPathValue};
 use super::functions::{bounded, count, round, substring, to_number, translated};
 use super::{Expr, Function};
 
@@ -11,39 +11,39 @@ impl Evaluator<'_> {
         &mut self,
         function: Function,
         all: &[Expr],
-        at: Context,
-        work: &mut Work,
-    ) -> Evaluated<Value> {
+        at: XPathContext,
+        work: &mut WorkBudget,
+    ) -> Evaluated<XPathValue> {
         let first = all.first();
         Ok(match function {
-            Function::Current => Value::Nodes(vec![at.row]),
-            Function::Position => Value::Number(count(at.position)),
-            Function::Last => Value::Number(count(at.size)),
-            Function::True => Value::Boolean(true),
-            Function::False => Value::Boolean(false),
-            Function::Not => Value::Boolean(!self.truth_of(first, at, work)?),
-            Function::Boolean => Value::Boolean(self.truth_of(first, at, work)?),
-            Function::Count => Value::Number(count(self.nodes_of(first, at, work)?.len())),
+            Function::Current => XPathValue::Nodes(vec![at.row]),
+            Function::Position => XPathValue::Number(count(at.position)),
+            Function::Last => XPathValue::Number(count(at.size)),
+            Function::True => XPathValue::Boolean(true),
+            Function::False => XPathValue::Boolean(false),
+            Function::Not => XPathValue::Boolean(!self.truth_of(first, at, work)?),
+            Function::Boolean => XPathValue::Boolean(self.truth_of(first, at, work)?),
+            Function::Count => XPathValue::Number(count(self.nodes_of(first, at, work)?.len())),
             Function::Sum => {
                 let nodes = self.nodes_of(first, at, work)?;
                 let texts = self.texts(&nodes, work)?;
-                Value::Number(texts.iter().map(|text| to_number(text)).sum())
+                XPathValue::Number(texts.iter().map(|text| to_number(text)).sum())
             }
-            Function::Number => Value::Number(to_number(&self.text_of(first, at, work)?)),
-            Function::Floor => Value::Number(self.number_of(first, at, work)?.floor()),
-            Function::Ceiling => Value::Number(self.number_of(first, at, work)?.ceil()),
-            Function::Round => Value::Number(round(self.number_of(first, at, work)?)),
+            Function::Number => XPathValue::Number(to_number(&self.text_of(first, at, work)?)),
+            Function::Floor => XPathValue::Number(self.number_of(first, at, work)?.floor()),
+            Function::Ceiling => XPathValue::Number(self.number_of(first, at, work)?.ceil()),
+            Function::Round => XPathValue::Number(round(self.number_of(first, at, work)?)),
             Function::LocalName | Function::Name | Function::NamespaceUri => {
                 let node = match first {
                     Some(expr) => self.evaluate_nodes(expr, at, work)?.first().copied(),
                     None => Some(at.node),
                 };
                 let name = node.map(|node| self.name(node, function));
-                Value::Text(name.unwrap_or_default())
+                XPathValue::Text(name.unwrap_or_default())
             }
             Function::StringLength => {
                 let text = self.text_of(first, at, work)?;
-                Value::Number(count(text.chars().count()))
+                XPathValue::Number(count(text.chars().count()))
             }
             Function::Concat => {
                 let mut text = String::new();
@@ -51,7 +51,7 @@ impl Evaluator<'_> {
                     text.push_str(&self.evaluate_text(part, at, work)?);
                     work.spend(text.len())?;
                 }
-                Value::Text(bounded(text)?)
+                XPathValue::Text(bounded(text)?)
             }
             Function::Substring => {
                 let text = self.text_of(first, at, work)?;
@@ -60,21 +60,21 @@ impl Evaluator<'_> {
                     Some(length) => Some(self.evaluate_number(length, at, work)?),
                     None => None,
                 };
-                Value::Text(substring(&text, start, length))
+                XPathValue::Text(substring(&text, start, length))
             }
             Function::Translate => {
                 let text = self.text_of(first, at, work)?;
                 let from = self.text_of(all.get(1), at, work)?;
                 let to = self.text_of(all.get(2), at, work)?;
-                Value::Text(bounded(translated(&text, &from, &to))?)
+                XPathValue::Text(bounded(translated(&text, &from, &to))?)
             }
             Function::NormalizeSpace => {
                 let text = self.text_of(first, at, work)?;
-                Value::Text(text.split_whitespace().collect::<Vec<_>>().join(" "))
+                XPathValue::Text(text.split_whitespace().collect::<Vec<_>>().join(" "))
             }
-            Function::String => Value::Text(self.text_of(first, at, work)?),
-            Function::LowerCase => Value::Text(self.text_of(first, at, work)?.to_lowercase()),
-            Function::UpperCase => Value::Text(self.text_of(first, at, work)?.to_uppercase()),
+            Function::String => XPathValue::Text(self.text_of(first, at, work)?),
+            Function::LowerCase => XPathValue::Text(self.text_of(first, at, work)?.to_lowercase()),
+            Function::UpperCase => XPathValue::Text(self.text_of(first, at, work)?.to_uppercase()),
             Function::Contains
             | Function::StartsWith
             | Function::EndsWith
@@ -87,28 +87,43 @@ impl Evaluator<'_> {
         })
     }
 
-    fn truth_of(&mut self, expr: Option<&Expr>, at: Context, work: &mut Work) -> Evaluated<bool> {
+    fn truth_of(
+        &mut self,
+        expr: Option<&Expr>,
+        at: XPathContext,
+        work: &mut WorkBudget,
+    ) -> Evaluated<bool> {
         expr.map_or(Ok(false), |expr| self.truth(expr, at, work))
     }
 
     fn nodes_of(
         &mut self,
         expr: Option<&Expr>,
-        at: Context,
-        work: &mut Work,
+        at: XPathContext,
+        work: &mut WorkBudget,
     ) -> Evaluated<Vec<NodeRef>> {
         expr.map_or(Ok(Vec::new()), |expr| self.evaluate_nodes(expr, at, work))
     }
 
     /// Returns the text of an argument, or of the node of the context.
-    fn text_of(&mut self, expr: Option<&Expr>, at: Context, work: &mut Work) -> Evaluated<String> {
+    fn text_of(
+        &mut self,
+        expr: Option<&Expr>,
+        at: XPathContext,
+        work: &mut WorkBudget,
+    ) -> Evaluated<String> {
         match expr {
             Some(expr) => self.evaluate_text(expr, at, work),
             None => self.of_node(at.node, work),
         }
     }
 
-    fn number_of(&mut self, expr: Option<&Expr>, at: Context, work: &mut Work) -> Evaluated<f64> {
+    fn number_of(
+        &mut self,
+        expr: Option<&Expr>,
+        at: XPathContext,
+        work: &mut WorkBudget,
+    ) -> Evaluated<f64> {
         expr.map_or(Ok(f64::NAN), |expr| self.evaluate_number(expr, at, work))
     }
 
@@ -137,15 +152,15 @@ impl Evaluator<'_> {
     }
 }
 
-fn searched(function: Function, text: &str, part: &str) -> Value {
+fn searched(function: Function, text: &str, part: &str) -> XPathValue {
     if function == Function::Contains {
-        return Value::Boolean(text.contains(part));
+        return XPathValue::Boolean(text.contains(part));
     }
     if function == Function::StartsWith {
-        return Value::Boolean(text.starts_with(part));
+        return XPathValue::Boolean(text.starts_with(part));
     }
     if function == Function::EndsWith {
-        return Value::Boolean(text.ends_with(part));
+        return XPathValue::Boolean(text.ends_with(part));
     }
     // An empty part is at the start of each text.
     let (before, after) = text.split_once(part).unwrap_or_default();
@@ -153,5 +168,5 @@ fn searched(function: Function, text: &str, part: &str) -> Value {
         true => after,
         false => before,
     };
-    Value::Text(found.to_owned())
+    XPathValue::Text(found.to_owned())
 }

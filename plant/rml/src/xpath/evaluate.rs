@@ -7,7 +7,9 @@ use std::sync::Arc;
 use roxmltree::{Document, Node, NodeId};
 
 use super::functions::{any_pair, bounded, count, holds, of_number, to_number};
-use super::{Axis, Comparison, Expr, Join, Operator, Path, Space, Start, Step, Test};
+use super::{
+    Axis, Comparison, Expr, Join, LocationPath, NamespaceTest, Operator, Start, Test, XPathStep,
+};
 
 /// A node or an attribute of a document. The order is that of the document.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -19,12 +21,12 @@ pub(crate) struct NodeRef {
 
 /// The remaining work of a run: visited nodes, and bytes of text.
 #[derive(Debug)]
-pub(crate) struct Work {
+pub(crate) struct WorkBudget {
     left: u64,
     most: u64,
 }
 
-impl Work {
+impl WorkBudget {
     pub(crate) fn new(most: u64) -> Self {
         Self { left: most, most }
     }
@@ -44,7 +46,7 @@ impl Work {
 
 /// The value of an expression.
 #[derive(Debug)]
-pub(super) enum Value {
+pub(super) enum XPathValue {
     Nodes(Vec<NodeRef>),
     Text(String),
     Number(f64),
@@ -53,7 +55,7 @@ pub(super) enum Value {
 
 /// The context of an expression (XPath 1.0, 1), and the node of the row.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Context {
+pub(super) struct XPathContext {
     pub(super) node: NodeRef,
     pub(super) position: usize,
     pub(super) size: usize,
@@ -82,11 +84,11 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Returns the nodes of an expression at the root of the document.
-    pub(crate) fn rows(&mut self, expr: &Expr, work: &mut Work) -> Evaluated<Vec<NodeRef>> {
+    pub(crate) fn rows(&mut self, expr: &Expr, work: &mut WorkBudget) -> Evaluated<Vec<NodeRef>> {
         let root = itself(self.document.root());
-        match self.evaluate(expr, Context::of(root), work)? {
-            Value::Nodes(nodes) => Ok(nodes),
-            Value::Text(_) | Value::Number(_) | Value::Boolean(_) => {
+        match self.evaluate(expr, XPathContext::of(root), work)? {
+            XPathValue::Nodes(nodes) => Ok(nodes),
+            XPathValue::Text(_) | XPathValue::Number(_) | XPathValue::Boolean(_) => {
                 Err("the iterator is no path".to_owned())
             }
         }
@@ -97,30 +99,39 @@ impl<'a> Evaluator<'a> {
         &mut self,
         expr: &Expr,
         row: NodeRef,
-        work: &mut Work,
+        work: &mut WorkBudget,
     ) -> Evaluated<Vec<String>> {
-        match self.evaluate(expr, Context::of(row), work)? {
-            Value::Nodes(nodes) => self.texts(&nodes, work),
-            other @ (Value::Text(_) | Value::Number(_) | Value::Boolean(_)) => {
+        match self.evaluate(expr, XPathContext::of(row), work)? {
+            XPathValue::Nodes(nodes) => self.texts(&nodes, work),
+            other @ (XPathValue::Text(_) | XPathValue::Number(_) | XPathValue::Boolean(_)) => {
                 Ok(vec![self.text(other, work)?])
             }
         }
     }
 
-    fn evaluate(&mut self, expr: &Expr, at: Context, work: &mut Work) -> Evaluated<Value> {
+    fn evaluate(
+        &mut self,
+        expr: &Expr,
+        at: XPathContext,
+        work: &mut WorkBudget,
+    ) -> Evaluated<XPathValue> {
         work.spend(1)?;
         Ok(match expr {
-            Expr::Or(a, b) => Value::Boolean(self.truth(a, at, work)? || self.truth(b, at, work)?),
-            Expr::And(a, b) => Value::Boolean(self.truth(a, at, work)? && self.truth(b, at, work)?),
+            Expr::Or(a, b) => {
+                XPathValue::Boolean(self.truth(a, at, work)? || self.truth(b, at, work)?)
+            }
+            Expr::And(a, b) => {
+                XPathValue::Boolean(self.truth(a, at, work)? && self.truth(b, at, work)?)
+            }
             Expr::Compare(comparison, a, b) => {
                 let a = self.evaluate(a, at, work)?;
                 let b = self.evaluate(b, at, work)?;
-                Value::Boolean(self.compare(*comparison, a, b, work)?)
+                XPathValue::Boolean(self.compare(*comparison, a, b, work)?)
             }
             Expr::Calculate(operator, a, b) => {
                 let a = self.evaluate_number(a, at, work)?;
                 let b = self.evaluate_number(b, at, work)?;
-                Value::Number(match operator {
+                XPathValue::Number(match operator {
                     Operator::Add => a + b,
                     Operator::Subtract => a - b,
                     Operator::Multiply => a * b,
@@ -128,16 +139,16 @@ impl<'a> Evaluator<'a> {
                     Operator::Remainder => a % b,
                 })
             }
-            Expr::Negate(a) => Value::Number(-self.evaluate_number(a, at, work)?),
+            Expr::Negate(a) => XPathValue::Number(-self.evaluate_number(a, at, work)?),
             Expr::Union(a, b) => {
                 let mut nodes = self.evaluate_nodes(a, at, work)?;
                 nodes.extend(self.evaluate_nodes(b, at, work)?);
                 ordered(&mut nodes);
-                Value::Nodes(nodes)
+                XPathValue::Nodes(nodes)
             }
-            Expr::Path(path) => Value::Nodes(self.path(path, at, work)?),
-            Expr::Text(text) => Value::Text(text.clone()),
-            Expr::Number(number) => Value::Number(*number),
+            Expr::Path(path) => XPathValue::Nodes(self.path(path, at, work)?),
+            Expr::Text(text) => XPathValue::Text(text.clone()),
+            Expr::Number(number) => XPathValue::Number(*number),
             Expr::Call(function, all) => self.call(*function, all, at, work)?,
         })
     }
@@ -145,12 +156,12 @@ impl<'a> Evaluator<'a> {
     pub(super) fn evaluate_nodes(
         &mut self,
         expr: &Expr,
-        at: Context,
-        work: &mut Work,
+        at: XPathContext,
+        work: &mut WorkBudget,
     ) -> Evaluated<Vec<NodeRef>> {
         match self.evaluate(expr, at, work)? {
-            Value::Nodes(nodes) => Ok(nodes),
-            Value::Text(_) | Value::Number(_) | Value::Boolean(_) => {
+            XPathValue::Nodes(nodes) => Ok(nodes),
+            XPathValue::Text(_) | XPathValue::Number(_) | XPathValue::Boolean(_) => {
                 Err("a path was expected, and not a text, number or truth value".to_owned())
             }
         }
@@ -159,8 +170,8 @@ impl<'a> Evaluator<'a> {
     pub(super) fn evaluate_text(
         &mut self,
         expr: &Expr,
-        at: Context,
-        work: &mut Work,
+        at: XPathContext,
+        work: &mut WorkBudget,
     ) -> Evaluated<String> {
         let value = self.evaluate(expr, at, work)?;
         self.text(value, work)
@@ -169,18 +180,28 @@ impl<'a> Evaluator<'a> {
     pub(super) fn evaluate_number(
         &mut self,
         expr: &Expr,
-        at: Context,
-        work: &mut Work,
+        at: XPathContext,
+        work: &mut WorkBudget,
     ) -> Evaluated<f64> {
         let value = self.evaluate(expr, at, work)?;
         self.number(value, work)
     }
 
-    pub(super) fn truth(&mut self, expr: &Expr, at: Context, work: &mut Work) -> Evaluated<bool> {
+    pub(super) fn truth(
+        &mut self,
+        expr: &Expr,
+        at: XPathContext,
+        work: &mut WorkBudget,
+    ) -> Evaluated<bool> {
         Ok(boolean(&self.evaluate(expr, at, work)?))
     }
 
-    fn path(&mut self, path: &Path, at: Context, work: &mut Work) -> Evaluated<Vec<NodeRef>> {
+    fn path(
+        &mut self,
+        path: &LocationPath,
+        at: XPathContext,
+        work: &mut WorkBudget,
+    ) -> Evaluated<Vec<NodeRef>> {
         let (mut nodes, mut done) = match (&path.start, &path.index) {
             (Start::Context, _) => (vec![at.node], 0),
             (Start::Root, Some(index)) => {
@@ -214,7 +235,12 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Returns the nodes of the leading steps of an absolute path.
-    fn fixed(&mut self, key: &Arc<str>, steps: &[Step], work: &mut Work) -> Evaluated<Nodes> {
+    fn fixed(
+        &mut self,
+        key: &Arc<str>,
+        steps: &[XPathStep],
+        work: &mut WorkBudget,
+    ) -> Evaluated<Nodes> {
         if let Some(known) = self.fixed.get(key) {
             return Ok(Rc::clone(known));
         }
@@ -232,14 +258,14 @@ impl<'a> Evaluator<'a> {
     fn joined(
         &mut self,
         before: &[NodeRef],
-        (step, join): (&Step, &Join),
-        at: Context,
-        work: &mut Work,
+        (step, join): (&XPathStep, &Join),
+        at: XPathContext,
+        work: &mut WorkBudget,
     ) -> Evaluated<Vec<NodeRef>> {
         let table = match self.tables.get(&join.key) {
             Some(known) => Rc::clone(known),
             None => {
-                let all = Step {
+                let all = XPathStep {
                     axis: step.axis,
                     test: step.test.clone(),
                     predicates: Vec::new(),
@@ -256,8 +282,8 @@ impl<'a> Evaluator<'a> {
             }
         };
         let probes = match self.evaluate(&join.probe, at, work)? {
-            Value::Nodes(nodes) => self.texts(&nodes, work)?,
-            other @ (Value::Text(_) | Value::Number(_) | Value::Boolean(_)) => {
+            XPathValue::Nodes(nodes) => self.texts(&nodes, work)?,
+            other @ (XPathValue::Text(_) | XPathValue::Number(_) | XPathValue::Boolean(_)) => {
                 vec![self.text(other, work)?]
             }
         };
@@ -277,9 +303,9 @@ impl<'a> Evaluator<'a> {
     fn step(
         &mut self,
         before: &[NodeRef],
-        step: &Step,
+        step: &XPathStep,
         row: NodeRef,
-        work: &mut Work,
+        work: &mut WorkBudget,
     ) -> Evaluated<Vec<NodeRef>> {
         let mut all = Vec::new();
         let mut compact_at = COMPACT_AT;
@@ -305,20 +331,22 @@ impl<'a> Evaluator<'a> {
         nodes: Vec<NodeRef>,
         predicate: &Expr,
         row: NodeRef,
-        work: &mut Work,
+        work: &mut WorkBudget,
     ) -> Evaluated<Vec<NodeRef>> {
         let size = nodes.len();
         let mut kept = Vec::new();
         for (at, node) in nodes.into_iter().enumerate() {
-            let context = Context {
+            let context = XPathContext {
                 node,
                 position: at + 1,
                 size,
                 row,
             };
             let holds = match self.evaluate(predicate, context, work)? {
-                Value::Number(number) => number == count(at + 1),
-                other @ (Value::Nodes(_) | Value::Text(_) | Value::Boolean(_)) => boolean(&other),
+                XPathValue::Number(number) => number == count(at + 1),
+                other @ (XPathValue::Nodes(_) | XPathValue::Text(_) | XPathValue::Boolean(_)) => {
+                    boolean(&other)
+                }
             };
             if holds {
                 kept.push(node);
@@ -328,7 +356,12 @@ impl<'a> Evaluator<'a> {
     }
 
     /// Returns the nodes of an axis that pass the test, in the order of the axis.
-    fn axis(&self, from: NodeRef, step: &Step, work: &mut Work) -> Evaluated<Vec<NodeRef>> {
+    fn axis(
+        &self,
+        from: NodeRef,
+        step: &XPathStep,
+        work: &mut WorkBudget,
+    ) -> Evaluated<Vec<NodeRef>> {
         let Some(node) = self.document.get_node(NodeId::new(from.id)) else {
             return Ok(Vec::new());
         };
@@ -413,12 +446,12 @@ impl<'a> Evaluator<'a> {
         }
     }
 
-    pub(super) fn texts(&self, nodes: &[NodeRef], work: &mut Work) -> Evaluated<Vec<String>> {
+    pub(super) fn texts(&self, nodes: &[NodeRef], work: &mut WorkBudget) -> Evaluated<Vec<String>> {
         nodes.iter().map(|node| self.of_node(*node, work)).collect()
     }
 
     /// Returns the string value of a node (XPath 1.0, 5).
-    pub(super) fn of_node(&self, node: NodeRef, work: &mut Work) -> Evaluated<String> {
+    pub(super) fn of_node(&self, node: NodeRef, work: &mut WorkBudget) -> Evaluated<String> {
         let mut all = String::new();
         let Some(found) = self.document.get_node(NodeId::new(node.id)) else {
             return Ok(all);
@@ -443,54 +476,56 @@ impl<'a> Evaluator<'a> {
         bounded(all)
     }
 
-    fn text(&self, value: Value, work: &mut Work) -> Evaluated<String> {
+    fn text(&self, value: XPathValue, work: &mut WorkBudget) -> Evaluated<String> {
         Ok(match value {
-            Value::Nodes(nodes) => match nodes.first() {
+            XPathValue::Nodes(nodes) => match nodes.first() {
                 Some(first) => self.of_node(*first, work)?,
                 None => String::new(),
             },
-            Value::Text(text) => text,
-            Value::Number(number) => of_number(number),
-            Value::Boolean(is) => is.to_string(),
+            XPathValue::Text(text) => text,
+            XPathValue::Number(number) => of_number(number),
+            XPathValue::Boolean(is) => is.to_string(),
         })
     }
 
-    fn number(&self, value: Value, work: &mut Work) -> Evaluated<f64> {
+    fn number(&self, value: XPathValue, work: &mut WorkBudget) -> Evaluated<f64> {
         Ok(match value {
-            Value::Number(number) => number,
-            Value::Boolean(is) => f64::from(u8::from(is)),
-            other @ (Value::Nodes(_) | Value::Text(_)) => to_number(&self.text(other, work)?),
+            XPathValue::Number(number) => number,
+            XPathValue::Boolean(is) => f64::from(u8::from(is)),
+            other @ (XPathValue::Nodes(_) | XPathValue::Text(_)) => {
+                to_number(&self.text(other, work)?)
+            }
         })
     }
 
     fn compare(
         &self,
         comparison: Comparison,
-        a: Value,
-        b: Value,
-        work: &mut Work,
+        a: XPathValue,
+        b: XPathValue,
+        work: &mut WorkBudget,
     ) -> Evaluated<bool> {
         let is_equality = matches!(comparison, Comparison::Equal | Comparison::NotEqual);
         Ok(match (a, b) {
-            (Value::Nodes(a), Value::Nodes(b)) => {
+            (XPathValue::Nodes(a), XPathValue::Nodes(b)) => {
                 let (a, b) = (self.texts(&a, work)?, self.texts(&b, work)?);
                 any_pair(comparison, &a, &b)
             }
-            (Value::Boolean(a), b) if is_equality => holds(comparison, &a, &boolean(&b)),
-            (a, Value::Boolean(b)) if is_equality => holds(comparison, &boolean(&a), &b),
-            (Value::Nodes(a), Value::Text(b)) if is_equality => {
+            (XPathValue::Boolean(a), b) if is_equality => holds(comparison, &a, &boolean(&b)),
+            (a, XPathValue::Boolean(b)) if is_equality => holds(comparison, &boolean(&a), &b),
+            (XPathValue::Nodes(a), XPathValue::Text(b)) if is_equality => {
                 any_pair(comparison, &self.texts(&a, work)?, &[b])
             }
-            (Value::Text(a), Value::Nodes(b)) if is_equality => {
+            (XPathValue::Text(a), XPathValue::Nodes(b)) if is_equality => {
                 any_pair(comparison, &[a], &self.texts(&b, work)?)
             }
-            (Value::Text(a), Value::Text(b)) if is_equality => holds(comparison, &a, &b),
-            (Value::Nodes(a), b) => {
+            (XPathValue::Text(a), XPathValue::Text(b)) if is_equality => holds(comparison, &a, &b),
+            (XPathValue::Nodes(a), b) => {
                 let b = self.number(b, work)?;
                 let a = self.texts(&a, work)?;
                 a.iter().any(|a| holds(comparison, &to_number(a), &b))
             }
-            (a, Value::Nodes(b)) => {
+            (a, XPathValue::Nodes(b)) => {
                 let a = self.number(a, work)?;
                 let b = self.texts(&b, work)?;
                 b.iter().any(|b| holds(comparison, &a, &to_number(b)))
@@ -503,7 +538,7 @@ impl<'a> Evaluator<'a> {
     }
 }
 
-impl Context {
+impl XPathContext {
     fn of(node: NodeRef) -> Self {
         Self {
             node,
@@ -516,9 +551,9 @@ impl Context {
 
 /// The nodes of an axis that pass the test of a step.
 struct Found<'s, 'w> {
-    step: &'s Step,
+    step: &'s XPathStep,
     all: Vec<NodeRef>,
-    work: &'w mut Work,
+    work: &'w mut WorkBudget,
 }
 
 impl Found<'_, '_> {
@@ -585,12 +620,16 @@ fn passes(node: Node<'_, '_>, test: &Test) -> Evaluated<bool> {
     })
 }
 
-fn in_space(space: &Space, namespace: Option<&str>, document: &Document<'_>) -> Evaluated<bool> {
+fn in_space(
+    space: &NamespaceTest,
+    namespace: Option<&str>,
+    document: &Document<'_>,
+) -> Evaluated<bool> {
     match space {
-        Space::Any => Ok(true),
-        Space::None => Ok(namespace.is_none()),
-        Space::Uri(uri) => Ok(namespace == Some(uri)),
-        Space::OfDocument(prefix) => {
+        NamespaceTest::Any => Ok(true),
+        NamespaceTest::None => Ok(namespace.is_none()),
+        NamespaceTest::Uri(uri) => Ok(namespace == Some(uri)),
+        NamespaceTest::OfDocument(prefix) => {
             let root = document.root_element();
             match root.lookup_namespace_uri(Some(prefix)) {
                 Some(uri) => Ok(namespace == Some(uri)),
@@ -603,12 +642,12 @@ fn in_space(space: &Space, namespace: Option<&str>, document: &Document<'_>) -> 
     }
 }
 
-fn boolean(value: &Value) -> bool {
+fn boolean(value: &XPathValue) -> bool {
     match value {
-        Value::Nodes(nodes) => !nodes.is_empty(),
-        Value::Text(text) => !text.is_empty(),
-        Value::Number(number) => *number != 0.0 && !number.is_nan(),
-        Value::Boolean(is) => *is,
+        XPathValue::Nodes(nodes) => !nodes.is_empty(),
+        XPathValue::Text(text) => !text.is_empty(),
+        XPathValue::Number(number) => *number != 0.0 && !number.is_nan(),
+        XPathValue::Boolean(is) => *is,
     }
 }
 

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use super::tokens::{Kind, Token, tokens};
+use super::tokens::{Token, TokenKind, tokens};
 use super::{
-    Axis, Comparison, Expr, Function, Index, Join, Namespaces, Operator, Path, Space, Start, Step,
-    Test,
+    Axis, Comparison, Expr, Function, Join, LocationPath, NamespaceTest, Namespaces, Operator,
+    PathIndex, Start, Test, XPathStep,
 };
 
 /// Parses an expression.
@@ -132,14 +132,14 @@ impl Parser<'_> {
             Start::Root => index(&steps),
             Start::Context | Start::Filter(..) => None,
         };
-        Ok(Expr::Path(Box::new(Path {
+        Ok(Expr::Path(Box::new(LocationPath {
             start,
             steps,
             index,
         })))
     }
 
-    fn steps(&mut self, steps: &mut Vec<Step>) -> Parsed<()> {
+    fn steps(&mut self, steps: &mut Vec<XPathStep>) -> Parsed<()> {
         loop {
             if steps.len() >= MAX_DEPTH {
                 return Err(format!("the path has more than {MAX_DEPTH} steps"));
@@ -154,10 +154,10 @@ impl Parser<'_> {
         }
     }
 
-    fn step(&mut self) -> Parsed<Step> {
+    fn step(&mut self) -> Parsed<XPathStep> {
         for (symbol, axis) in [("..", Axis::Parent), (".", Axis::Itself)] {
             if self.take(symbol) {
-                return Ok(Step {
+                return Ok(XPathStep {
                     axis,
                     test: Test::Node,
                     predicates: Vec::new(),
@@ -170,7 +170,7 @@ impl Parser<'_> {
         while self.take("[") {
             predicates.push(self.predicate()?);
         }
-        Ok(Step {
+        Ok(XPathStep {
             axis,
             test,
             predicates,
@@ -182,7 +182,7 @@ impl Parser<'_> {
             return Ok(Axis::Attribute);
         }
         let named = match (self.peek(0), self.peek(1)) {
-            (Some(Kind::Name(None, name)), Some(Kind::Symbol("::"))) => name.clone(),
+            (Some(TokenKind::Name(None, name)), Some(TokenKind::Symbol("::"))) => name.clone(),
             _ => return Ok(Axis::Child),
         };
         self.next += 2;
@@ -196,13 +196,13 @@ impl Parser<'_> {
     }
 
     fn test(&mut self) -> Parsed<Test> {
-        let Some(Kind::Name(prefix, local)) = self.peek(0).cloned() else {
+        let Some(TokenKind::Name(prefix, local)) = self.peek(0).cloned() else {
             return Err(self.wrong("the name of an element or attribute"));
         };
         self.next += 1;
         if prefix.is_none() && self.take("(") {
             let target = match self.peek(0).cloned() {
-                Some(Kind::Text(text)) if local == "processing-instruction" => {
+                Some(TokenKind::Text(text)) if local == "processing-instruction" => {
                     self.next += 1;
                     Some(text)
                 }
@@ -220,13 +220,13 @@ impl Parser<'_> {
             };
         }
         let space = match prefix {
-            None if local == "*" || self.namespaces.is_empty() => Space::Any,
-            None => Space::None,
+            None if local == "*" || self.namespaces.is_empty() => NamespaceTest::Any,
+            None => NamespaceTest::None,
             Some(prefix) => {
                 let declared = self.namespaces.iter().find(|(known, _)| *known == prefix);
                 match declared {
-                    Some((_, uri)) => Space::Uri(uri.clone()),
-                    None => Space::OfDocument(prefix),
+                    Some((_, uri)) => NamespaceTest::Uri(uri.clone()),
+                    None => NamespaceTest::OfDocument(prefix),
                 }
             }
         };
@@ -246,19 +246,19 @@ impl Parser<'_> {
             return Ok(expr);
         }
         match self.peek(0).cloned() {
-            Some(Kind::Text(text)) => {
+            Some(TokenKind::Text(text)) => {
                 self.next += 1;
                 Ok(Expr::Text(text))
             }
-            Some(Kind::Number(number)) => {
+            Some(TokenKind::Number(number)) => {
                 self.next += 1;
                 Ok(Expr::Number(number))
             }
-            Some(Kind::Name(prefix, name)) => {
+            Some(TokenKind::Name(prefix, name)) => {
                 self.next += 2;
                 self.call(prefix, &name)
             }
-            Some(Kind::Symbol(_)) | None => Err(self.wrong("a path, a text or a number")),
+            Some(TokenKind::Symbol(_)) | None => Err(self.wrong("a path, a text or a number")),
         }
     }
 
@@ -296,22 +296,22 @@ impl Parser<'_> {
     /// Returns whether the next token begins a step, and not a function.
     fn begins_step(&self) -> bool {
         match (self.peek(0), self.peek(1)) {
-            (Some(Kind::Symbol("@" | "." | "..")), _) => true,
-            (Some(Kind::Name(None, name)), Some(Kind::Symbol("("))) => {
+            (Some(TokenKind::Symbol("@" | "." | "..")), _) => true,
+            (Some(TokenKind::Name(None, name)), Some(TokenKind::Symbol("("))) => {
                 ["node", "text", "comment", "processing-instruction"].contains(&name.as_str())
             }
-            (Some(Kind::Name(Some(_), _)), Some(Kind::Symbol("("))) => false,
-            (Some(Kind::Name(..)), _) => true,
+            (Some(TokenKind::Name(Some(_), _)), Some(TokenKind::Symbol("("))) => false,
+            (Some(TokenKind::Name(..)), _) => true,
             _ => false,
         }
     }
 
-    fn peek(&self, ahead: usize) -> Option<&Kind> {
+    fn peek(&self, ahead: usize) -> Option<&TokenKind> {
         self.tokens.get(self.next + ahead).map(|token| &token.kind)
     }
 
     fn take(&mut self, symbol: &str) -> bool {
-        let found = matches!(self.peek(0), Some(Kind::Symbol(next)) if *next == symbol);
+        let found = matches!(self.peek(0), Some(TokenKind::Symbol(next)) if *next == symbol);
         self.next += usize::from(found);
         found
     }
@@ -355,8 +355,8 @@ fn binary(symbol: &str, left: Expr, right: Expr) -> Expr {
     }
 }
 
-fn any_descendant() -> Step {
-    Step {
+fn any_descendant() -> XPathStep {
+    XPathStep {
         axis: Axis::DescendantOrSelf,
         test: Test::Node,
         predicates: Vec::new(),
@@ -365,8 +365,8 @@ fn any_descendant() -> Step {
 
 /// Splits predicates with `and`, and turns `//name` into one step. Both change no result, because
 /// no predicate of such a step depends on a position.
-fn shortened(steps: Vec<Step>) -> Vec<Step> {
-    let mut all: Vec<Step> = Vec::new();
+fn shortened(steps: Vec<XPathStep>) -> Vec<XPathStep> {
+    let mut all: Vec<XPathStep> = Vec::new();
     for mut step in steps {
         if !step.predicates.iter().any(Expr::is_positional) {
             step.predicates = step.predicates.into_iter().flat_map(conjuncts).collect();
@@ -394,7 +394,7 @@ fn conjuncts(expr: Expr) -> Vec<Expr> {
 }
 
 /// Returns the index of an absolute path.
-fn index(steps: &[Step]) -> Option<Index> {
+fn index(steps: &[XPathStep]) -> Option<PathIndex> {
     let fixed = steps.iter().take_while(|step| !step.has_current()).count();
     let leading = steps.get(..fixed)?;
     let key = format!("{leading:?}");
@@ -402,14 +402,14 @@ fn index(steps: &[Step]) -> Option<Index> {
         .get(fixed)
         .and_then(|step| join(&key, step))
         .map(Box::new);
-    Some(Index {
+    Some(PathIndex {
         key: key.into(),
         steps: fixed,
         join,
     })
 }
 
-fn join(before: &str, step: &Step) -> Option<Join> {
+fn join(before: &str, step: &XPathStep) -> Option<Join> {
     if step.predicates.iter().any(Expr::is_positional) {
         return None;
     }
@@ -439,13 +439,13 @@ fn join(before: &str, step: &Step) -> Option<Join> {
     })
 }
 
-fn shown(kind: &Kind) -> String {
+fn shown(kind: &TokenKind) -> String {
     match kind {
-        Kind::Number(number) => format!("`{number}`"),
-        Kind::Text(text) => format!("the text `{text}`"),
-        Kind::Name(None, name) => format!("`{name}`"),
-        Kind::Name(Some(prefix), name) => format!("`{prefix}:{name}`"),
-        Kind::Symbol(symbol) => format!("`{symbol}`"),
+        TokenKind::Number(number) => format!("`{number}`"),
+        TokenKind::Text(text) => format!("the text `{text}`"),
+        TokenKind::Name(None, name) => format!("`{name}`"),
+        TokenKind::Name(Some(prefix), name) => format!("`{prefix}:{name}`"),
+        TokenKind::Symbol(symbol) => format!("`{symbol}`"),
     }
 }
 

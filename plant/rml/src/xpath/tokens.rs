@@ -3,12 +3,12 @@
 /// A token with the position of its first character, from 1.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Token {
-    pub(super) kind: Kind,
+    pub(super) kind: TokenKind,
     pub(super) position: usize,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Kind {
+pub(super) enum TokenKind {
     Number(f64),
     Text(String),
     /// A name, which may have a prefix. The local name may be `*`.
@@ -35,19 +35,23 @@ pub(super) fn tokens(text: &str) -> Result<Vec<Token>, String> {
         let before = text.get(..text.len() - rest.len()).unwrap_or_default();
         let position = before.chars().count() + 1;
         let (kind, after) = one(rest, first, all.last().map(|token| &token.kind))
-            .map_err(|what| format!("{what} at character {position}"))?;
+            .map_err(|problem| format!("{problem} at character {position}"))?;
         all.push(Token { kind, position });
         rest = after;
     }
 }
 
-fn one<'a>(rest: &'a str, first: char, before: Option<&Kind>) -> Result<(Kind, &'a str), String> {
+fn one<'a>(
+    rest: &'a str,
+    first: char,
+    before: Option<&TokenKind>,
+) -> Result<(TokenKind, &'a str), String> {
     if let quote @ ('"' | '\'') = first {
         let inner = rest.get(1..).unwrap_or_default();
         let (text, after) = inner
             .split_once(quote)
             .ok_or_else(|| format!("the text has no closing {quote}"))?;
-        return Ok((Kind::Text(text.to_owned()), after));
+        return Ok((TokenKind::Text(text.to_owned()), after));
     }
     let fraction = rest.strip_prefix('.').and_then(|rest| rest.chars().next());
     if first.is_ascii_digit() || fraction.is_some_and(|digit| digit.is_ascii_digit()) {
@@ -56,13 +60,13 @@ fn one<'a>(rest: &'a str, first: char, before: Option<&Kind>) -> Result<(Kind, &
         let number = number
             .parse()
             .map_err(|_| format!("`{number}` is not a number"))?;
-        return Ok((Kind::Number(number), after));
+        return Ok((TokenKind::Number(number), after));
     }
     if first == '*' {
         let after = rest.get(1..).unwrap_or_default();
         return Ok(match ends_operand(before) {
-            true => (Kind::Symbol("*"), after),
-            false => (Kind::Name(None, "*".to_owned()), after),
+            true => (TokenKind::Symbol("*"), after),
+            false => (TokenKind::Name(None, "*".to_owned()), after),
         });
     }
     if let Some(symbol) = SYMBOLS.iter().find(|symbol| rest.starts_with(**symbol)) {
@@ -70,7 +74,7 @@ fn one<'a>(rest: &'a str, first: char, before: Option<&Kind>) -> Result<(Kind, &
             return Err("variables are not supported; write the value".to_owned());
         }
         return Ok((
-            Kind::Symbol(symbol),
+            TokenKind::Symbol(symbol),
             rest.get(symbol.len()..).unwrap_or_default(),
         ));
     }
@@ -80,7 +84,7 @@ fn one<'a>(rest: &'a str, first: char, before: Option<&Kind>) -> Result<(Kind, &
         let Some(operator) = operator.into_iter().find(|operator| *operator == name) else {
             return Err(format!("an operator is missing before `{name}`"));
         };
-        return Ok((Kind::Symbol(operator), after));
+        return Ok((TokenKind::Symbol(operator), after));
     }
     // A colon is part of the name unless the name is an axis.
     if let Some(local) = after
@@ -88,13 +92,19 @@ fn one<'a>(rest: &'a str, first: char, before: Option<&Kind>) -> Result<(Kind, &
         .filter(|rest| !rest.starts_with(':'))
     {
         if let Some(after) = local.strip_prefix('*') {
-            return Ok((Kind::Name(Some(name.to_owned()), "*".to_owned()), after));
+            return Ok((
+                TokenKind::Name(Some(name.to_owned()), "*".to_owned()),
+                after,
+            ));
         }
         let (local, after) =
             self::name(local).ok_or_else(|| format!("no name follows the prefix `{name}`"))?;
-        return Ok((Kind::Name(Some(name.to_owned()), local.to_owned()), after));
+        return Ok((
+            TokenKind::Name(Some(name.to_owned()), local.to_owned()),
+            after,
+        ));
     }
-    Ok((Kind::Name(None, name.to_owned()), after))
+    Ok((TokenKind::Name(None, name.to_owned()), after))
 }
 
 fn name(text: &str) -> Option<(&str, &str)> {
@@ -105,10 +115,10 @@ fn name(text: &str) -> Option<(&str, &str)> {
 }
 
 /// Returns whether an operator may follow.
-fn ends_operand(before: Option<&Kind>) -> bool {
+fn ends_operand(before: Option<&TokenKind>) -> bool {
     match before {
         None => false,
-        Some(Kind::Number(_) | Kind::Text(_) | Kind::Name(..)) => true,
-        Some(Kind::Symbol(symbol)) => matches!(*symbol, ")" | "]" | "." | ".."),
+        Some(TokenKind::Number(_) | TokenKind::Text(_) | TokenKind::Name(..)) => true,
+        Some(TokenKind::Symbol(symbol)) => matches!(*symbol, ")" | "]" | "." | ".."),
     }
 }

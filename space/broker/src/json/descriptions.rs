@@ -10,17 +10,17 @@ use uadp::discovery::{
 use uadp::{BuiltinType, NetworkMessage, NodeId, PublisherId, SecurityHeader, StatusCode};
 
 /// PublisherId, WriterGroupId and DataSetWriterId.
-pub(super) type Triple = (u16, u16, u16);
+pub(super) type WriterIds = (u16, u16, u16);
 
 /// The fields of the known DataSets.
 #[derive(Debug, Default)]
 pub(super) struct Descriptions {
-    known: BTreeMap<Triple, Vec<Field>>,
+    known: BTreeMap<WriterIds, Vec<DataSetField>>,
 }
 
 /// A field of a DataSet.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Field {
+pub(super) struct DataSetField {
     pub(super) name: String,
     /// The builtin type; `None` if the values have different types.
     pub(super) builtin: Option<BuiltinType>,
@@ -28,14 +28,14 @@ pub(super) struct Field {
 }
 
 impl Descriptions {
-    pub(super) fn of(&self, topic: Triple) -> Option<&[Field]> {
+    pub(super) fn of(&self, topic: WriterIds) -> Option<&[DataSetField]> {
         self.known.get(&topic).map(Vec::as_slice)
     }
 
     /// Records the metadata in a UADP message. Returns its topic and its DataSet.
-    pub(super) fn learn(&mut self, message: &NetworkMessage<'_>) -> Option<Triple> {
+    pub(super) fn learn(&mut self, message: &NetworkMessage<'_>) -> Option<WriterIds> {
         let (topic, meta_data) = meta_data(message)?;
-        let fields = meta_data.fields.iter().map(|field| Field {
+        let fields = meta_data.fields.iter().map(|field| DataSetField {
             name: field.name.unwrap_or_default().to_owned(),
             builtin: field
                 .builtin_type()
@@ -46,16 +46,16 @@ impl Descriptions {
         Some(topic)
     }
 
-    fn insert(&mut self, topic: Triple, fields: Vec<Field>) {
+    fn insert(&mut self, topic: WriterIds, fields: Vec<DataSetField>) {
         if self.known.len() < MAX_KNOWN || self.known.contains_key(&topic) {
             self.known.insert(topic, fields);
         }
     }
 
     /// Records the `MetaData` of a JSON message, and returns it as a UADP announcement.
-    pub(super) fn read(&mut self, topic: Triple, json: &Value) -> Option<Vec<u8>> {
+    pub(super) fn read(&mut self, topic: WriterIds, json: &Value) -> Option<Vec<u8>> {
         let list = json.get("Fields")?.as_array()?;
-        let fields: Vec<Field> = list.iter().map(field).collect::<Option<_>>()?;
+        let fields: Vec<DataSetField> = list.iter().map(field).collect::<Option<_>>()?;
         let (publisher, group, writer) = topic;
         let name = json.get("Name").and_then(Value::as_str).unwrap_or_default();
         let name = match name.starts_with("ua_") {
@@ -109,11 +109,11 @@ impl Descriptions {
     }
 }
 
-fn field(json: &Value) -> Option<Field> {
+fn field(json: &Value) -> Option<DataSetField> {
     let number = json.get("BuiltInType").and_then(Value::as_u64);
     let builtin = number.and_then(|id| BuiltinType::from_id(u8::try_from(id).ok()?));
     let rank = json.get("ValueRank").and_then(Value::as_i64).unwrap_or(-1);
-    Some(Field {
+    Some(DataSetField {
         name: json.get("Name")?.as_str()?.to_owned(),
         builtin: builtin.filter(|of| *of != BuiltinType::Variant),
         value_rank: i32::try_from(rank).ok()?,
@@ -121,7 +121,7 @@ fn field(json: &Value) -> Option<Field> {
 }
 
 /// Returns the metadata in a UADP message as the `MetaData` of a JSON message.
-pub(super) fn to_json(message: &NetworkMessage<'_>) -> Option<(Triple, Value)> {
+pub(super) fn to_json(message: &NetworkMessage<'_>) -> Option<(WriterIds, Value)> {
     let (topic, meta_data) = meta_data(message)?;
     let fields: Vec<Value> = meta_data
         .fields
@@ -149,7 +149,7 @@ pub(super) fn to_json(message: &NetworkMessage<'_>) -> Option<(Triple, Value)> {
 }
 
 /// Returns the metadata in a UADP message, if it names a topic of the space.
-fn meta_data<'a>(message: &NetworkMessage<'a>) -> Option<(Triple, DataSetMetaDataType<'a>)> {
+fn meta_data<'a>(message: &NetworkMessage<'a>) -> Option<(WriterIds, DataSetMetaDataType<'a>)> {
     if message.is_sealed() || message.is_chunk() {
         return None;
     }

@@ -8,12 +8,12 @@ use uadp::{
     PublisherId, Variant,
 };
 
-use super::{Field, Json, Triple};
+use super::{DataSetField, Json, WriterIds};
 use crate::topics::Address;
 
 /// The contents of a JSON message.
 #[derive(Debug, Default, PartialEq)]
-pub(crate) struct Reading {
+pub(crate) struct JsonContents {
     /// NetworkMessages of UADP.
     pub(crate) messages: Vec<Vec<u8>>,
     pub(crate) status: Option<(ConnectionState, Option<CyclicStatus>)>,
@@ -35,7 +35,11 @@ impl Json {
     ///
     /// # Errors
     /// The reason why the whole message is dropped.
-    pub(crate) fn read(&mut self, text: &[u8], address: Address) -> Result<Reading, &'static str> {
+    pub(crate) fn read(
+        &mut self,
+        text: &[u8],
+        address: Address,
+    ) -> Result<JsonContents, &'static str> {
         if text.len() > MAX_TEXT {
             return Err("malformed_json");
         }
@@ -71,14 +75,14 @@ impl Json {
                 let topic = (inherited.publisher, group, writer);
                 let meta_data = whole.get("MetaData").unwrap_or(&Value::Null);
                 let announcement = self.others.read(topic, meta_data);
-                Ok(Reading {
+                Ok(JsonContents {
                     messages: vec![announcement.ok_or("malformed_json")?],
-                    ..Reading::default()
+                    ..JsonContents::default()
                 })
             }
-            Some("ua-status") => Ok(Reading {
+            Some("ua-status") => Ok(JsonContents {
                 status: Some(status(whole).ok_or("malformed_json")?),
-                ..Reading::default()
+                ..JsonContents::default()
             }),
             _ => Ok(match whole.get("Messages") {
                 Some(Value::Array(list)) => self.data(list, inherited),
@@ -88,8 +92,8 @@ impl Json {
         }
     }
 
-    fn data(&self, list: &[Value], inherited: Inherited) -> Reading {
-        let mut reading = Reading::default();
+    fn data(&self, list: &[Value], inherited: Inherited) -> JsonContents {
+        let mut reading = JsonContents::default();
         for message in list {
             match self.data_set(message, inherited, &mut reading.faults) {
                 Ok(bytes) => reading.messages.push(bytes),
@@ -177,7 +181,7 @@ impl Json {
     /// Returns the Variants of a payload by their index; `None` for a field that is not there.
     fn fields(
         &self,
-        topic: Triple,
+        topic: WriterIds,
         payload: &Map<String, Value>,
         faults: &mut Vec<&'static str>,
     ) -> Result<Vec<Option<Vec<u8>>>, &'static str> {
@@ -193,7 +197,7 @@ impl Json {
         if payload.keys().any(|key| !is_known(key)) {
             faults.push("unknown_field");
         }
-        let value = |field: &Field| {
+        let value = |field: &DataSetField| {
             let value = payload.get(&field.name);
             value.map(|value| variant(value, Some(field))).transpose()
         };
@@ -240,7 +244,7 @@ fn delta(
 
 /// Returns the bytes of a Variant: with its type (UaType and Value, Type and Body), as a DataValue,
 /// or plain and with the type of the metadata.
-fn variant(json: &Value, field: Option<&Field>) -> Result<Vec<u8>, &'static str> {
+fn variant(json: &Value, field: Option<&DataSetField>) -> Result<Vec<u8>, &'static str> {
     if let Some(whole) = json.as_object() {
         let typed = [("UaType", "Value"), ("Type", "Body")]
             .iter()
@@ -283,7 +287,7 @@ fn variant(json: &Value, field: Option<&Field>) -> Result<Vec<u8>, &'static str>
     })
 }
 
-fn is_structure(field: &Field) -> bool {
+fn is_structure(field: &DataSetField) -> bool {
     field.builtin == Some(uadp::BuiltinType::ExtensionObject)
 }
 

@@ -9,10 +9,10 @@ use uadp::{
 };
 
 use super::*;
-use crate::topics::{Address, MessageType};
+use crate::topics::{Address, TopicMessageType};
 
 const TOPIC: Address = Address {
-    kind: MessageType::Data,
+    kind: TopicMessageType::Data,
     publisher: 1,
     group: Some(2),
     writer: Some(10),
@@ -103,7 +103,7 @@ fn both(form: MessageMapping) -> (Json, Json) {
     let (mut sender, mut receiver) = (Json::new(form), Json::new(MessageMapping::Uadp));
     let described = sender.describe(&announcement, now()).unwrap();
     let meta = Address {
-        kind: MessageType::MetaData,
+        kind: TopicMessageType::MetaData,
         ..TOPIC
     };
     let learned = receiver.read(&described, meta).unwrap();
