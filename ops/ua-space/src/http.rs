@@ -63,6 +63,11 @@ impl Server {
         }
     }
 
+    /// Returns `host:port`.
+    pub(crate) fn authority(&self) -> &str {
+        &self.authority
+    }
+
     /// Requests a path, which begins with a slash.
     ///
     /// # Errors

@@ -1,18 +1,19 @@
 //! Inspects a running space: receives the messages of its group without a mapping.
 
 mod all;
+mod announcements;
 mod application;
 mod bandwidth;
 pub(crate) mod book;
 mod call;
 mod carrier;
-mod channels;
-mod described;
+pub(crate) mod channels;
+pub(crate) mod described;
 mod echo;
 mod list;
 mod names;
 mod parameters;
-mod plain;
+pub(crate) mod plain;
 mod prober;
 mod record;
 mod replay;
@@ -285,10 +286,11 @@ impl Live {
         match self.receive(until).await? {
             Incoming::Interrupted => Ok(Some(Ended::Interrupted)),
             Incoming::Nothing => Ok(None),
-            Incoming::Message(Received { length, from }) => {
+            Incoming::Message(received @ Received { length, from, .. }) => {
+                let arrived = self.arrived(&received);
                 let datagram = self.buffer.get(..length).unwrap_or_default();
                 let read = (&mut self.book, self.sealing.as_mut());
-                Ok(take(read, (datagram, from), self.start.elapsed(), each))
+                Ok(take(read, (datagram, from), arrived, each))
             }
         }
     }
@@ -304,6 +306,18 @@ impl Live {
                 .map(Incoming::Message)
                 .map_err(|error| Failure::Io(format!("cannot hear the group: {error}"))),
         }
+    }
+
+    /// Returns the time at which the kernel received a message, since the group was joined. Without
+    /// it, and if the clock was set meanwhile, it is the present time.
+    fn arrived(&self, received: &Received) -> Duration {
+        let now = self.now();
+        let stamp = received.stamp.map(of_system_time);
+        let stamp = stamp.and_then(|stamp| u64::try_from(stamp - self.start_utc).ok());
+        let stamp = stamp.map(Duration::from_nanos);
+        let waited = |stamp: &Duration| now.checked_sub(*stamp);
+        let fits = |stamp: &Duration| waited(stamp).is_some_and(|waited| waited <= LONGEST_WAIT);
+        stamp.filter(fits).unwrap_or(now)
     }
 
     /// Returns whether an address is the source of own messages.
@@ -393,7 +407,12 @@ fn take(
 
 #[expect(clippy::disallowed_methods, reason = "the one read of this clock")]
 pub(crate) fn unix_nanos() -> i128 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH);
+    of_system_time(SystemTime::now())
+}
+
+/// Returns the nanoseconds since 1970.
+fn of_system_time(time: SystemTime) -> i128 {
+    let since = time.duration_since(UNIX_EPOCH);
     i128::try_from(since.unwrap_or_default().as_nanos()).unwrap_or_default()
 }
 
@@ -412,5 +431,7 @@ pub(crate) fn until(now: Duration, seconds: Option<f64>) -> Duration {
     }
 }
 
+/// The longest time that a message waits in the socket.
+const LONGEST_WAIT: Duration = Duration::from_secs(10);
 /// The interval at which due probes are sent.
 const LOOK: Duration = Duration::from_millis(100);

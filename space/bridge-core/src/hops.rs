@@ -14,8 +14,8 @@ pub enum Hop {
     /// From the producer's bridge to this program through the PubSub network (tTR0). Between two
     /// hosts it is only as accurate as the synchronization of their clocks.
     Network,
-    /// From the arrival of the datagram to the local publication, in this program (tPB of the
-    /// consumer's bridge).
+    /// From the arrival of the datagram, at the kernel if it stamps datagrams, to the local
+    /// publication in this program (tPB of the consumer's bridge).
     In,
 }
 

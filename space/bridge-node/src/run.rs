@@ -27,7 +27,7 @@ use uadp::Timestamp;
 use crate::awaited::PeerWatch;
 use crate::busy_poll::BusyPoll;
 use crate::carrier::NO_SOURCE;
-use crate::clock::now;
+use crate::clock::{now, timestamp};
 use crate::exit::{Failure, FailureKind};
 use crate::keys::{self, KeyRing, NewKeys};
 use crate::mapping_file::Running;
@@ -306,6 +306,7 @@ impl<P: Port> Shell<P> {
             },
         )
         .with_library(self.library)
+        .with_time(now().utc)
         .with_uptime(now().monotonic.saturating_duration_since(self.started))
         .with_links(self.port.links())
         .with_certificate(self.port.certificate())
@@ -387,14 +388,19 @@ impl<P: Port> Shell<P> {
 
     fn heard(&mut self, heard: io::Result<Received>, buffer: &[u8]) {
         match heard {
-            Ok(Received { length, from }) => {
+            Ok(Received {
+                length,
+                from,
+                stamp,
+            }) => {
                 let datagram = buffer.get(..length).unwrap_or_default();
                 let now = now();
                 self.busy.arrived(now.monotonic);
                 self.observe(|observer| observer.datagram(datagram, from));
                 let (relay, forwarding) = network::arrival(self.carrier.as_ref());
                 self.router.set_arrival(relay, forwarding);
-                self.router.handle_datagram(datagram, from, now);
+                let received = stamp.map(timestamp);
+                self.router.handle_received(datagram, (from, received), now);
             }
             // Probably an ICMP error for a unicast peer; the socket stays usable.
             Err(error) => debug!(%error, "receiving failed"),

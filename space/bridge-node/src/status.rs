@@ -25,6 +25,8 @@ pub(crate) struct Status {
     version: &'static str,
     /// Seconds since the start of the program.
     uptime_s: u64,
+    /// The time of this status by the clock of the host, in microseconds since 1970.
+    time_us: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
     library: Option<&'static str>,
     space: u8,
@@ -209,6 +211,7 @@ impl Status {
             program,
             version: build_info::version(),
             uptime_s: 0,
+            time_us: 0,
             library: None,
             space: space.get(),
             readiness,
@@ -233,6 +236,11 @@ impl Status {
 
     pub(crate) const fn with_library(mut self, library: Option<&'static str>) -> Self {
         self.library = library;
+        self
+    }
+
+    pub(crate) fn with_time(mut self, utc: Timestamp) -> Self {
+        self.time_us = u64::try_from(utc.unix_nanos() / 1000).unwrap_or_default();
         self
     }
 

@@ -429,6 +429,7 @@ impl Mqtt {
         Some(Received {
             length: bytes.len(),
             from,
+            stamp: None,
         })
     }
 }

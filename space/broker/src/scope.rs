@@ -3,7 +3,7 @@
 use uadp::NetworkMessage;
 
 use crate::address::{self, Addressed};
-use crate::topics::MessageType;
+use crate::topics::TopicMessageType;
 
 /// The ids and the role of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -41,21 +41,21 @@ pub fn scope(message: &NetworkMessage<'_>) -> Option<MessageScope> {
     let Addressed { address, withdrawn } = address::of(message, None)?;
     let is_hidden = message.is_sealed() || message.is_chunk();
     let role = match address.kind {
-        MessageType::Data => MessageRole::Value,
-        MessageType::Probe => MessageRole::Probe,
-        MessageType::ActionRequest | MessageType::ActionResponse if is_hidden => {
+        TopicMessageType::Data => MessageRole::Value,
+        TopicMessageType::Probe => MessageRole::Probe,
+        TopicMessageType::ActionRequest | TopicMessageType::ActionResponse if is_hidden => {
             MessageRole::HiddenCall
         }
-        MessageType::ActionRequest => MessageRole::Request,
-        MessageType::ActionResponse => MessageRole::Response,
-        MessageType::MetaData
-        | MessageType::Status
-        | MessageType::Connection
-        | MessageType::Application
-        | MessageType::Endpoints
-        | MessageType::ActionMetaData
-        | MessageType::ActionResponder
-        | MessageType::Discovery => MessageRole::Announcement,
+        TopicMessageType::ActionRequest => MessageRole::Request,
+        TopicMessageType::ActionResponse => MessageRole::Response,
+        TopicMessageType::MetaData
+        | TopicMessageType::Status
+        | TopicMessageType::Connection
+        | TopicMessageType::Application
+        | TopicMessageType::Endpoints
+        | TopicMessageType::ActionMetaData
+        | TopicMessageType::ActionResponder
+        | TopicMessageType::Discovery => MessageRole::Announcement,
     };
     let triple = withdrawn.map(mappings::TopicId::triple);
     Some(MessageScope {

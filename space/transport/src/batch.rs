@@ -5,8 +5,13 @@ use std::fmt;
 use std::io::{self, IoSlice, IoSliceMut};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::os::fd::{AsFd, RawFd};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use nix::sys::socket::{MsgFlags, MultiHeaders, SockaddrIn, recvmmsg};
+use nix::cmsg_space;
+use nix::sys::socket::{
+    ControlMessageOwned, MsgFlags, MultiHeaders, RecvMsg, SockaddrIn, recvmmsg,
+};
+use nix::sys::time::TimeSpec;
 use rustix::net::{MMsgHdr, SendAncillaryBuffer, SendFlags, SocketAddrAny, sendmmsg};
 
 use crate::carrier::{BUFFER, Outgoing, Received};
@@ -17,7 +22,7 @@ pub(crate) const AT_ONCE: usize = 32;
 thread_local! {
     /// The headers of a receiving call. They refer to memory only during the call.
     static HEADERS: RefCell<MultiHeaders<SockaddrIn>> =
-        RefCell::new(MultiHeaders::preallocate(AT_ONCE, None));
+        RefCell::new(MultiHeaders::preallocate(AT_ONCE, Some(cmsg_space!(TimeSpec))));
 }
 
 /// The datagrams of a receiving call that were not yet taken.
@@ -42,6 +47,7 @@ impl Default for Batch {
         let nothing = Received {
             length: 0,
             from: SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0)),
+            stamp: None,
         };
         Self {
             buffers: Box::new([const { Vec::new() }; AT_ONCE]),
@@ -75,6 +81,7 @@ impl Batch {
                 *place = Received {
                     length: message.bytes,
                     from: from.unwrap_or(place.from),
+                    stamp: stamp(&message),
                 };
                 count += 1;
             }
@@ -113,6 +120,19 @@ impl Batch {
     pub(crate) const fn clear(&mut self) {
         self.taken = self.count;
     }
+}
+
+/// Returns the time at which the kernel received a datagram, if the kernel stamps it.
+fn stamp(message: &RecvMsg<'_, '_, SockaddrIn>) -> Option<SystemTime> {
+    let stamp = message.cmsgs().ok()?.find_map(|control| {
+        let ControlMessageOwned::ScmTimestampns(stamp) = control else {
+            return None;
+        };
+        Some(stamp)
+    })?;
+    let seconds = u64::try_from(stamp.tv_sec()).ok()?;
+    let nanos = u32::try_from(stamp.tv_nsec()).ok()?;
+    UNIX_EPOCH.checked_add(Duration::new(seconds, nanos))
 }
 
 /// Sends up to [`AT_ONCE`] messages to one target. Returns the number of sent messages, which is

@@ -6,7 +6,7 @@ use std::future::poll_fn;
 use std::io;
 use std::net::SocketAddr;
 use std::task::{Context, Poll};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use crate::udp::{SendError, Udp};
 use crate::watch::Change;
@@ -174,6 +174,8 @@ pub struct Received {
     pub length: usize,
     /// Address of the sender, or of the broker.
     pub from: SocketAddr,
+    /// Time at which the kernel received the message; `None` if it is not known.
+    pub stamp: Option<SystemTime>,
 }
 
 /// The distinction of senders, from the weakest to the strongest.

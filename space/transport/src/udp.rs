@@ -7,10 +7,12 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::AsRawFd as _;
 use std::task::{Context, Poll, ready};
 
+use nix::sys::socket::setsockopt;
+use nix::sys::socket::sockopt::ReceiveTimestampns;
 use socket2::{Domain, Protocol, Socket, Type};
 use tokio::io::Interest;
 use tokio::net::UdpSocket;
-use tracing::info;
+use tracing::{debug, info};
 
 use crate::batch::{self, Batch};
 use crate::carrier::{Capacity, Outgoing, Received};
@@ -489,6 +491,10 @@ fn receiver(
     socket
         .set_nonblocking(true)
         .map_err(at("set non-blocking mode"))?;
+    // The kernel stamps the datagrams for measurements of delays, where it can.
+    if let Err(error) = setsockopt(&socket, ReceiveTimestampns, &true) {
+        debug!(%error, "the kernel does not stamp datagrams: delays end at this program");
+    }
     socket
         .set_recv_buffer_size(options.receive_buffer)
         .map_err(at("set the receive buffer"))?;

@@ -250,10 +250,15 @@ pub(crate) struct Trace {
     /// same time. Shows the offsets of their clocks, and the corrected delays between them
     #[arg(long, value_name = "FILE", conflicts_with_all = ["metrics", "follow", "perfetto", "svg", "otlp"])]
     pub(crate) recording: Vec<PathBuf>,
-    /// Send the counters and delays of programs as metrics of OpenTelemetry (OTLP over HTTP) to
-    /// this collector, as http://127.0.0.1:4318, every --seconds (10), until Ctrl-C
+    /// Send the counters and delays of programs as metrics of OpenTelemetry (OTLP over HTTP), and
+    /// samples as traces, to this collector, as http://127.0.0.1:4318, every --seconds (10), until
+    /// Ctrl-C
     #[arg(long, value_name = "URL", conflicts_with_all = ["follow", "perfetto", "svg", "json"])]
     pub(crate) otlp: Option<String>,
+    /// With --otlp: the number of samples of each topic that are sent as traces in each period; 0
+    /// sends metrics only and does not listen in the group
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(0..=1000), requires = "otlp")]
+    pub(crate) traces: u16,
     /// Print a JSON object, or with --follow a JSON object for each sample
     #[arg(long)]
     pub(crate) json: bool,

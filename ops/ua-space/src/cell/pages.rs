@@ -20,6 +20,9 @@ pub(crate) struct Page {
     pub(crate) program: String,
     pub(crate) version: Option<String>,
     pub(crate) uptime_s: Option<u64>,
+    /// The clock of the host of the program, in microseconds since 1970.
+    #[serde(skip_serializing)]
+    pub(crate) time_us: Option<u64>,
     pub(crate) space: u8,
     pub(crate) not_ready: Vec<String>,
     pub(crate) waiting_for: Vec<String>,

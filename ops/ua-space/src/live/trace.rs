@@ -7,20 +7,25 @@
 mod clocks;
 mod drawing;
 mod follow;
+mod offsets;
 mod otlp;
 mod perfetto;
 mod protobuf;
 mod recordings;
+mod spans;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs;
 use std::io::{self, Write as _};
+use std::net::IpAddr;
 use std::path::Path;
 
 use mappings::TopicId;
 use serde::Serialize;
 use uadp::MessageKind;
 
+use self::clocks::Estimate;
+use self::offsets::Offsets;
 use super::book::{News, Sample};
 use super::list::json;
 use super::text::{Table, is_coloured, micros};
@@ -41,15 +46,19 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
         return recordings::trace(arguments);
     }
     if let Some(url) = &arguments.otlp {
-        return look(otlp::export(arguments, url));
+        return otlp::export(arguments, url);
     }
     let seconds = arguments.seconds.unwrap_or(USUAL);
-    let mut topics = Vec::new();
+    for url in &arguments.metrics {
+        Server::parse(url)?;
+    }
+    let (mut topics, mut clocks) = (Vec::new(), Vec::new());
     if seconds > 0.0 {
-        topics = in_group(&arguments.group, async |mut live| {
+        (topics, clocks) = in_group(&arguments.group, async |mut live| {
+            let mut delays = Delays::by(Offsets::watch(&arguments.metrics).await);
             let end = until(live.now(), Some(seconds));
             let start = live.start_utc();
-            let (mut delays, mut samples) = (Delays::default(), Samples::of(arguments));
+            let mut samples = Samples::of(arguments);
             live.listen(end, &mut |news, now| {
                 if let News::Sample(sample) = &news {
                     samples.take(delays.take(sample, utc(start, now)));
@@ -64,15 +73,12 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
             for row in &mut rows {
                 row.name = row.topic.parse().ok().and_then(name_of);
             }
-            Ok(rows)
+            Ok((rows, delays.clocks.clocks()))
         })?;
     } else if arguments.perfetto.is_some() || arguments.svg.is_some() {
         return Err(Failure::Usage(
             "--perfetto and --svg need samples: give another --seconds than 0".to_owned(),
         ));
-    }
-    for url in &arguments.metrics {
-        Server::parse(url)?;
     }
     let (mut programs, mut is_missing) = (Vec::new(), false);
     for url in &arguments.metrics {
@@ -84,7 +90,7 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
             }
         }
     }
-    print(arguments, &programs, &topics)?;
+    print(arguments, &programs, &topics, &clocks)?;
     match is_missing {
         true => Err(Failure::NotThere),
         false => Ok(()),
@@ -96,7 +102,9 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
 struct Times {
     topic: TopicId,
     sequence: Option<u16>,
-    /// The time at which its writer took the value; `None` for a repeated value.
+    /// The time at which its writer took the value, by the clock of the writer.
+    stamp: Option<i128>,
+    /// The same time by the clock of this host; `None` for a repeated value.
     taken: Option<i128>,
     sent: Option<i128>,
     arrived: i128,
@@ -211,12 +219,37 @@ struct Row {
 struct Shown<'a> {
     programs: &'a [Program],
     topics: &'a [Row],
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    clocks: Vec<ShownClock>,
+}
+
+/// The clock of a host, compared with the clock of this host.
+#[derive(Debug, Serialize)]
+struct ShownClock {
+    host: IpAddr,
+    offset_us: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    drift_ppm: Option<f64>,
+    within_us: f64,
+}
+
+impl ShownClock {
+    fn of((host, estimate): &(IpAddr, Estimate)) -> Self {
+        Self {
+            host: *host,
+            offset_us: recordings::in_micros(estimate.offset),
+            drift_ppm: estimate.drift_ppm,
+            within_us: recordings::in_micros(estimate.within),
+        }
+    }
 }
 
 /// The latest delays of topics.
 #[derive(Default)]
 struct Delays {
     topics: BTreeMap<TopicId, Topic>,
+    /// The clocks of other hosts.
+    clocks: Offsets,
 }
 
 #[derive(Default)]
@@ -236,6 +269,14 @@ struct Window {
 }
 
 impl Delays {
+    /// Returns no delays yet, to be corrected by these clocks.
+    fn by(clocks: Offsets) -> Self {
+        Self {
+            clocks,
+            ..Self::default()
+        }
+    }
+
     /// Records a message that arrived at the given time, in nanoseconds since 1970. Returns its
     /// times; `None` for a message without a value, and beyond the largest number of topics.
     fn take(&mut self, sample: &Sample<'_>, arrived: i128) -> Option<Times> {
@@ -244,14 +285,18 @@ impl Delays {
         {
             return None;
         }
+        let host = sample.from.ip();
+        let here = |time: Option<i128>| time.map(|time| self.clocks.corrected(host, time));
+        let (taken, sent) = (here(sample.taken()), here(sample.sent()));
         let topic = self.topics.entry(sample.topic).or_default();
-        let (taken, sent) = (sample.taken(), sample.sent());
-        let before = std::mem::replace(&mut topic.taken, taken);
+        // A repetition has the same time by the clock of its host.
+        let before = std::mem::replace(&mut topic.taken, sample.taken());
         // The first received message may be a repetition too.
-        let is_new = before.is_some() && before != taken;
+        let is_new = before.is_some() && before != sample.taken();
         let times = Times {
             topic: sample.topic,
             sequence: sample.message.sequence_number(),
+            stamp: sample.taken(),
             taken: taken.filter(|_| is_new),
             sent,
             arrived,
@@ -325,10 +370,20 @@ fn in_micros(nanos: u64) -> f64 {
     nanos as f64 / 1000.0
 }
 
-fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), Failure> {
+fn print(
+    arguments: &Trace,
+    programs: &[Program],
+    topics: &[Row],
+    clocks: &[(IpAddr, Estimate)],
+) -> Result<(), Failure> {
     let mut out = io::stdout().lock();
     if arguments.json {
-        writeln!(out, "{}", json(&Shown { programs, topics })?)?;
+        let shown = Shown {
+            programs,
+            topics,
+            clocks: clocks.iter().map(ShownClock::of).collect(),
+        };
+        writeln!(out, "{}", json(&shown)?)?;
         return Ok(());
     }
     let bold = is_coloured();
@@ -360,6 +415,21 @@ fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), 
         table.without_empty_columns().write(&mut out, bold)?;
     } else if programs.is_empty() {
         writeln!(out, "no message with its times was received")?;
+    }
+    if !clocks.is_empty() {
+        let columns = ["HOST", "OFFSET", "WITHIN", "DRIFT PPM"];
+        let mut table = Table::new(columns.map(str::to_owned));
+        for (host, estimate) in clocks {
+            let drift = estimate.drift_ppm.map(|drift| format!("{drift:+.1}"));
+            table.row([
+                host.to_string(),
+                recordings::signed(estimate.offset),
+                micros(recordings::in_micros(estimate.within)),
+                drift.unwrap_or_else(|| "-".to_owned()),
+            ]);
+        }
+        writeln!(out)?;
+        table.write(&mut out, bold)?;
     }
     Ok(())
 }

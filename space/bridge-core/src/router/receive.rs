@@ -30,11 +30,25 @@ impl Router {
     /// Handles a datagram from the UA side. The values of its messages are queued, and errors are
     /// counted.
     pub fn handle_datagram(&mut self, datagram: &[u8], from: SocketAddr, now: Now) {
+        self.handle_received(datagram, (from, None), now);
+    }
+
+    /// Handles a datagram like [`handle_datagram`](Self::handle_datagram). Its delays are measured
+    /// to and from the time at which the kernel received it, if that is known. The age of a message
+    /// ends at `now` in any case.
+    pub fn handle_received(
+        &mut self,
+        datagram: &[u8],
+        (from, received): (SocketAddr, Option<Timestamp>),
+        now: Now,
+    ) {
+        self.values.received = received;
         match NetworkMessage::decode(datagram) {
             Ok(message) if self.security.is_on() => self.handle_guarded(&message, from, now),
             Ok(message) => self.handle_network_message(&message, from, now),
             Err(error) => self.values.drop_undecoded(None, from, &error),
         }
+        self.values.received = None;
         self.inquire(now);
     }
 
@@ -367,6 +381,7 @@ impl Values {
     ) {
         let topic = at.topic();
         let status = message.header().status.unwrap_or_default();
+        let arrived = self.arrival(now);
         let sample = |fields, quality: Quality| Sample {
             fields,
             source: quality.source.or(place.stamp),
@@ -374,7 +389,7 @@ impl Values {
             kept: admitted.kept,
             lasting: admitted.lasting,
             status: quality.status(status),
-            arrived: now.utc,
+            arrived,
         };
         let takes = self.take_base(at, message, place);
         match Self::plain(message, takes) {
@@ -583,7 +598,8 @@ impl Values {
         let Some(sent) = sent.filter(filled) else {
             return;
         };
-        self.hops.record(Hop::Network, sent, now.utc);
+        let arrived = self.arrival(now);
+        self.hops.record(Hop::Network, sent, arrived);
         let waited = place.is_stored() || (!place.held_back.is_zero() && !place.is_fresh());
         if let Some(taken) = place.stamp.filter(filled)
             && !waited

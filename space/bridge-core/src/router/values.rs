@@ -87,6 +87,8 @@ pub(super) struct Values {
     pub(super) tap: Tap,
     pub(super) buffers: Buffers,
     pub(super) hops: Hops,
+    /// The time at which the kernel received the current datagram, if it is known.
+    pub(super) received: Option<Timestamp>,
 }
 
 impl Values {
@@ -122,7 +124,18 @@ impl Values {
             tap: Tap::default(),
             buffers: Buffers::default(),
             hops: Hops::new(),
+            received: None,
         }
+    }
+
+    /// Returns the time from which the delays of the current datagram are measured. A time in the
+    /// future or long ago is of a clock that was set meanwhile.
+    pub(super) fn arrival(&self, now: Now) -> Timestamp {
+        let waited = |stamp: &Timestamp| now.utc.unix_nanos() - stamp.unix_nanos();
+        let received = self
+            .received
+            .filter(|stamp| (0..=LONGEST_WAIT).contains(&waited(stamp)));
+        received.unwrap_or(now.utc)
     }
 
     /// Binds a topic as [`Router::bind`] does. Returns whether it is a topic of the own space,
@@ -278,3 +291,5 @@ impl Values {
 /// The maximum number of unknown topics of other spaces. It limits memory, because any sender in
 /// the group can invent topics.
 pub(super) const MAX_STRAYS: usize = 16_384;
+/// The longest time that a datagram waits in the socket, in nanoseconds.
+const LONGEST_WAIT: i128 = 10_000_000_000;

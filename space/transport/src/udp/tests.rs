@@ -1,4 +1,4 @@
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use super::*;
 use crate::carrier::{BUFFER, Carrier};
@@ -47,6 +47,33 @@ fn every_member_of_the_group_hears_a_datagram_with_its_sender() {
             let mut buffer = [0; 64];
             let (len, from) = member.recv(&mut buffer).await.unwrap();
             assert_eq!((&buffer[..len], from), (&b"cover"[..], sender));
+        }
+    });
+}
+
+#[test]
+#[expect(clippy::disallowed_methods, reason = "the kernel stamps by this clock")]
+fn the_kernel_stamps_a_datagram_at_its_arrival_and_not_when_it_is_read() {
+    run(async {
+        let mut listener = Udp::open(&on_loopback(&format!("127.0.0.1:{}", free_port()))).unwrap();
+        let mut options = on_loopback(&format!("239.255.40.9:{}", free_port()));
+        options.peers = vec![listener.receiver.local_addr().unwrap()];
+        let sender = Udp::open(&options).unwrap();
+        let mut buffer = vec![0; BUFFER];
+        for turn in 0..3 {
+            let before = SystemTime::now();
+            sender.try_send(b"1").unwrap();
+            let sent = SystemTime::now();
+            // The datagram waits in the socket.
+            tokio::time::sleep(Duration::from_millis(20)).await;
+            let carrier: &mut dyn Carrier = &mut listener;
+            let received = carrier.recv(&mut buffer).await.unwrap();
+            let stamp = received.stamp.unwrap();
+            let late = Duration::from_millis(10);
+            assert!(
+                before <= stamp && stamp < sent + late,
+                "turn {turn}: {stamp:?}"
+            );
         }
     });
 }

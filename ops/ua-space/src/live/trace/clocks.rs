@@ -49,15 +49,23 @@ impl Estimate {
         let change = passed * self.drift_ppm.unwrap_or(0.0) / 1e6;
         self.offset + change as i128
     }
+
+    /// Returns a time of the second clock as a time of the first clock.
+    pub(super) fn corrected(&self, time: i128) -> i128 {
+        time - self.at(time - self.offset)
+    }
 }
 
-/// The smallest delays of both directions within a part of the time.
-#[derive(Debug, Clone, Copy)]
-struct Window {
-    at: i128,
-    offset: i128,
+/// The smallest delays of both directions within a part of the time, or of a request with its
+/// response.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Exchange {
+    /// The time of the offset by the first clock, in nanoseconds since 1970.
+    pub(super) at: i128,
+    /// The second clock minus the first, in nanoseconds.
+    pub(super) offset: i128,
     /// Half of the sum of both delays.
-    half: i128,
+    pub(super) half: i128,
 }
 
 /// Estimates the second clock from the messages of the first host (`forth`) and of the second host
@@ -82,15 +90,21 @@ pub(super) fn estimate(forth: &[Twice], back: &[Twice]) -> Option<Estimate> {
         let low = of_forth.iter().min_by_key(|one| one.difference);
         let high = of_back.iter().max_by_key(|one| one.difference);
         if let (Some(low), Some(high)) = (low, high) {
-            windows.push(Window {
+            windows.push(Exchange {
                 at: i128::midpoint(low.at, high.at),
                 offset: i128::midpoint(low.difference, high.difference),
                 half: ((low.difference - high.difference) / 2).abs(),
             });
         }
     }
+    fit(windows)
+}
+
+/// Estimates the second clock from exchanges in the order of their times. Returns `None` without
+/// exchanges.
+pub(super) fn fit(mut windows: Vec<Exchange>) -> Option<Estimate> {
     let within = windows.iter().map(|one| one.half).min()?;
-    // Windows without an undisturbed message of both directions say little.
+    // Exchanges without an undisturbed message of both directions say little.
     windows.retain(|one| one.half <= within.saturating_mul(2) + TOLERANCE);
     let at = i128::midpoint(windows.first()?.at, windows.last()?.at);
     let drift_ppm = drift(&windows);
@@ -112,7 +126,7 @@ pub(super) fn estimate(forth: &[Twice], back: &[Twice]) -> Option<Estimate> {
 
 /// Returns the median slope of all pairs of windows, in parts per million.
 #[expect(clippy::cast_precision_loss, reason = "a drift for people")]
-fn drift(windows: &[Window]) -> Option<f64> {
+fn drift(windows: &[Exchange]) -> Option<f64> {
     let mut slopes = Vec::new();
     for (at, one) in windows.iter().enumerate() {
         for other in windows.iter().skip(at + 1) {
@@ -196,6 +210,33 @@ mod tests {
                 let error = (found.drift_ppm.unwrap() - ppm as f64).abs();
                 assert!(error < 15.0, "{found:?}");
             }
+        }
+    }
+
+    #[test]
+    fn requests_and_responses_give_the_offset_of_a_drifting_clock() {
+        let exchanges = |count: i128| {
+            let each = (0..count).map(|number| {
+                let (there, back) = (delay(number), delay(number + 2));
+                let sent = number * 500 * MS;
+                let at = sent + (there + back) / 2;
+                let clock = sent + there + 3_000 * MS + (sent + there) * 50 / 1_000_000;
+                Exchange {
+                    at: START + at,
+                    offset: clock - at,
+                    half: (there + back) / 2,
+                }
+            });
+            each.collect::<Vec<_>>()
+        };
+        assert_eq!(fit(Vec::new()), None);
+        for count in [1, 8, 120] {
+            let found = fit(exchanges(count)).unwrap();
+            let last = count * 500 * MS;
+            let wanted = 3_000 * MS + last * 50 / 1_000_000;
+            let error = (found.at(START + last) - wanted).abs();
+            assert!(error < MS / 2, "{error} ns after {count}: {found:?}");
+            assert!(found.within < MS, "{found:?}");
         }
     }
 

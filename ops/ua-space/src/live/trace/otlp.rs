@@ -1,57 +1,161 @@
-//! `ua-space trace --otlp`: sends the counters and delays of programs as metrics of OpenTelemetry
-//! (OTLP 1.5 over HTTP). The request is a protobuf message `ExportMetricsServiceRequest`.
+//! `ua-space trace --otlp`: sends the counters and delays of programs as metrics of OpenTelemetry,
+//! and samples as traces (OTLP 1.5 over HTTP). The request is a protobuf message
+//! `ExportMetricsServiceRequest`; `spans` has the traces.
 
+use std::collections::BTreeMap;
+use std::hash::{BuildHasher as _, RandomState};
+use std::pin::pin;
 use std::time::Duration;
 
 use tokio::time::{MissedTickBehavior, interval, sleep};
 
+use super::super::book::News;
 use super::super::text::harmless;
-use super::super::unix_nanos;
+use super::super::{Ended, Go, Live, in_group, unix_nanos, utc};
+use super::Delays;
+use super::offsets::Offsets;
 use super::protobuf::Message;
+use super::spans::{self, Sampled, SampledValue};
 use crate::arguments::Trace;
 use crate::cell::{HopPage, Page, TopicPage, page_of_url, pages_of_this_host};
 use crate::exit::Failure;
 use crate::http::{Change, PROTOBUF, Server};
 use crate::interrupt::Interrupt;
 use crate::report::warn;
+use crate::survey::look;
 
 /// Exports until the user interrupts the command.
-pub(super) async fn export(arguments: &Trace, url: &str) -> Result<(), Failure> {
-    let collector = Server::parse(url)?;
+pub(super) fn export(arguments: &Trace, url: &str) -> Result<(), Failure> {
     let seconds = arguments.seconds.unwrap_or(USUAL).max(SHORTEST);
-    let period = Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
-    let mut interrupt = Interrupt::catch()?;
-    let mut ticks = interval(period);
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut is_sent = false;
-    let mut last = String::new();
-    loop {
-        let round = async {
-            ticks.tick().await;
-            send(&collector, &pages(arguments).await).await
-        };
-        let sent = tokio::select! {
-            biased;
-            () = interrupt.received() => break,
-            sent = round => sent,
-        };
-        match sent {
-            Ok(()) => {
-                is_sent = true;
-                last.clear();
-            }
-            Err(why) => {
-                // The same fault is reported once.
-                if why != last {
-                    warn(&format!("metrics were not sent: {why}"));
-                    last = why;
-                }
+    let period = Duration::try_from_secs_f64(seconds).unwrap_or(LONGEST);
+    let mut exporter = Exporter {
+        arguments,
+        collector: Server::parse(url)?,
+        period: period.min(LONGEST),
+        observer: RandomState::new().hash_one(0_u8),
+        is_sent: false,
+        last: BTreeMap::new(),
+        lost: 0,
+    };
+    match usize::from(arguments.traces) {
+        0 => look(exporter.run_alone())?,
+        most => in_group(&arguments.group, async |live| {
+            exporter.run(live, most).await
+        })?,
+    }
+    if exporter.lost > 0 {
+        warn(&format!("{} traces were not sent", exporter.lost));
+    }
+    match exporter.is_sent {
+        true => Ok(()),
+        false => Err(Failure::NotThere),
+    }
+}
+
+/// The export to a collector.
+struct Exporter<'a> {
+    arguments: &'a Trace,
+    collector: Server,
+    period: Duration,
+    /// A random number of this process.
+    observer: u64,
+    /// Whether the collector took something.
+    is_sent: bool,
+    /// The last fault of each path.
+    last: BTreeMap<&'static str, String>,
+    /// The number of traces that the collector did not take.
+    lost: usize,
+}
+
+impl Exporter<'_> {
+    /// Exports metrics until the user interrupts the command.
+    async fn run_alone(&mut self) -> Result<(), Failure> {
+        let mut interrupt = Interrupt::catch()?;
+        let mut ticks = interval(self.period);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            let round = async {
+                ticks.tick().await;
+                self.round(Vec::new()).await;
+            };
+            tokio::select! {
+                biased;
+                () = interrupt.received() => return Ok(()),
+                () = round => {}
             }
         }
     }
-    match is_sent {
-        true => Ok(()),
-        false => Err(Failure::NotThere),
+
+    /// Exports metrics and samples until the user interrupts the command. The group is received
+    /// while a request is sent.
+    async fn run(&mut self, mut live: Live, most: usize) -> Result<(), Failure> {
+        let mut delays = Delays::by(Offsets::watch(&self.arguments.metrics).await);
+        let (start, period) = (live.start_utc(), self.period);
+        let mut sampled = Sampled::new(most);
+        loop {
+            let batch = sampled.take(&|topic| live.name_of(topic));
+            let mut round = pin!(self.round(batch));
+            let mut is_over = false;
+            let mut each = |news: News<'_>, now| {
+                if let News::Sample(sample) = &news
+                    && let Some(times) = delays.take(sample, utc(start, now))
+                {
+                    sampled.add(times);
+                }
+                Go::On
+            };
+            let end = live.now() + period;
+            let mut listening = pin!(live.listen(end, &mut each));
+            let ended = loop {
+                tokio::select! {
+                    biased;
+                    ended = &mut listening => break ended?,
+                    () = &mut round, if !is_over => is_over = true,
+                }
+            };
+            if ended == Ended::Interrupted {
+                return Ok(());
+            }
+            if !is_over {
+                round.await;
+            }
+        }
+    }
+
+    /// Sends the metrics of all programs, and the spans of samples.
+    async fn round(&mut self, samples: Vec<SampledValue>) {
+        let pages = pages(self.arguments).await;
+        let sent = match pages.is_empty() {
+            true => Err("no program of this host has --metrics".to_owned()),
+            false => send(&self.collector, METRICS_PATH, request(&pages, unix_nanos())).await,
+        };
+        self.note(METRICS_PATH, sent);
+        if samples.is_empty() {
+            return;
+        }
+        let body = spans::request(&samples, &pages, self.observer);
+        let sent = send(&self.collector, TRACES_PATH, body).await;
+        if sent.is_err() {
+            self.lost += samples.len();
+        }
+        self.note(TRACES_PATH, sent);
+    }
+
+    /// Reports a fault; the same fault is reported once.
+    fn note(&mut self, path: &'static str, sent: Result<(), String>) {
+        let last = self.last.entry(path).or_default();
+        match sent {
+            Ok(()) => {
+                self.is_sent = true;
+                last.clear();
+            }
+            Err(why) if why != *last => {
+                let what = path.trim_start_matches("/v1/");
+                warn(&format!("{what} were not sent: {why}"));
+                *last = why;
+            }
+            Err(_) => {}
+        }
     }
 }
 
@@ -69,13 +173,9 @@ async fn pages(arguments: &Trace) -> Vec<Page> {
     pages
 }
 
-/// Sends the metrics, once more after a pause if the collector does not take them. Counters are
-/// totals, so the next export makes up for a lost one.
-async fn send(collector: &Server, pages: &[Page]) -> Result<(), String> {
-    if pages.is_empty() {
-        return Err("no program of this host has --metrics".to_owned());
-    }
-    let body = request(pages, unix_nanos());
+/// Sends a request, once more after a pause if the collector does not take it. Counters are totals,
+/// so the next export makes up for a lost one.
+async fn send(collector: &Server, path: &str, body: Vec<u8>) -> Result<(), String> {
     let mut why = String::new();
     for pause in [Duration::ZERO, RETRY] {
         sleep(pause).await;
@@ -85,7 +185,7 @@ async fn send(collector: &Server, pages: &[Page]) -> Result<(), String> {
             body: body.clone(),
             user: None,
         };
-        match collector.change("/v1/metrics", change).await {
+        match collector.change(path, change).await {
             Ok(answer) if (200..300).contains(&answer.status) => return Ok(()),
             Ok(answer) => {
                 why = format!("HTTP status {}: {}", answer.status, harmless(&answer.body));
@@ -252,7 +352,7 @@ fn quantiles(summary: &mut Message, (start, now): Times, name: &str, hop: &HopPa
     });
 }
 
-fn attribute(of: &mut Message, field: u32, name: &str, value: &str) {
+pub(super) fn attribute(of: &mut Message, field: u32, name: &str, value: &str) {
     of.message(field, |attribute| {
         attribute.text(KEY, name);
         attribute.message(VALUE, |any| any.text(STRING_VALUE, value));
@@ -262,7 +362,10 @@ fn attribute(of: &mut Message, field: u32, name: &str, value: &str) {
 /// The usual and the shortest period, in seconds.
 const USUAL: f64 = 10.0;
 const SHORTEST: f64 = 0.1;
+const LONGEST: Duration = Duration::from_secs(86_400);
 const RETRY: Duration = Duration::from_secs(1);
+const METRICS_PATH: &str = "/v1/metrics";
+const TRACES_PATH: &str = "/v1/traces";
 
 /// Fields of ExportMetricsServiceRequest, ResourceMetrics and ScopeMetrics.
 const RESOURCE_METRICS: u32 = 1;

@@ -237,6 +237,7 @@ mod tests {
         Times {
             topic: "ua_1_2_10".parse().unwrap(),
             sequence: Some(7),
+            stamp: taken,
             taken,
             sent: Some(sent),
             arrived,

@@ -69,6 +69,12 @@ struct Arrivals {
 impl Arrivals {
     fn read(file: &Path, keys: &RandomState) -> Result<Self, Failure> {
         let mut recorded = Recorded::open(file)?;
+        if recorded.has_only_values() {
+            return Err(Failure::Usage(format!(
+                "{}: an MCAP file has no senders; `ua-space record` writes them as .pcapng",
+                file.display()
+            )));
+        }
         let mut times = HashMap::new();
         let mut left_out: u64 = 0;
         while let Some(datagram) = recorded.next()? {
@@ -169,7 +175,7 @@ impl Clock {
 
     /// Returns a time of this clock as a time of the first clock.
     fn corrected(&self, time: i128) -> i128 {
-        time - self.estimate.at(time - self.estimate.offset)
+        self.estimate.corrected(time)
     }
 }
 
@@ -268,7 +274,7 @@ struct Shown<'a> {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a time shown to people")]
-fn in_micros(nanos: i128) -> f64 {
+pub(super) fn in_micros(nanos: i128) -> f64 {
     nanos as f64 / 1000.0
 }
 
@@ -339,7 +345,7 @@ fn print(arguments: &Trace, clocks: &[Clock], rows: &[Row]) -> Result<(), Failur
 }
 
 /// Returns an offset with its sign.
-fn signed(nanos: i128) -> String {
+pub(super) fn signed(nanos: i128) -> String {
     format!("{:+.3} ms", in_micros(nanos) / 1000.0)
 }
 
