@@ -153,6 +153,26 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
     eventually("the commands of the replay are in ROS 2", SOON, || {
         (!commands_there.values().is_empty()).then_some(())
     });
+    replay_values(&values, &joints_there);
+}
+
+/// Replays an MCAP file: its values are the same messages in ROS 2, and its commands are left out.
+fn replay_values(values: &Path, joints_there: &Child) {
+    let before = joints_there.values().len();
+    let (code, replayed) = ended(&["replay", text(values), "--speed", "0.5", "--json"]);
+    assert_eq!(code, 0, "{replayed}");
+    let summary = replayed.json_lines().pop().unwrap();
+    let left_out = summary["left_out"].as_object().unwrap();
+    let commanded = left_out.iter().any(|(why, count)| {
+        why.contains("--commands") && count.as_u64().is_some_and(|count| count > 0)
+    });
+    assert!(commanded, "{summary}");
+    eventually("values of the MCAP file are in ROS 2", SOON, || {
+        (joints_there.values().len() >= before + 5).then_some(())
+    });
+    let last = joints_there.values().pop().unwrap();
+    assert_eq!(last["position"], json!([0.5, -0.25]), "{last}");
+    assert_eq!(last["header"]["frame_id"], "base", "{last}");
 }
 
 #[test]

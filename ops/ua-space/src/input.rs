@@ -1,4 +1,4 @@
-//! Reads files: whole, or their datagrams (one datagram, several lines, or a capture).
+//! Reads files: whole, or their datagrams (one datagram, several lines, or a recording).
 
 use std::fs::File;
 use std::io::{self, BufReader, Read};
@@ -6,6 +6,7 @@ use std::io::{self, BufReader, Read};
 use crate::capture::{Capture, CaptureError, is_capture};
 use crate::exit::Failure;
 use crate::hex;
+use crate::recorded::is_mcap;
 
 /// A file with its detected format.
 pub(crate) enum Input {
@@ -14,6 +15,8 @@ pub(crate) enum Input {
     /// One datagram per line, each with its line number.
     Lines(Vec<(usize, Vec<u8>)>),
     Capture(Capture<Box<dyn Read>>),
+    /// An MCAP file, after its first four bytes.
+    Mcap(Box<dyn Read>),
 }
 
 /// Opens a file, `-` for stdin. With `lines`, every line of hexadecimal text is a datagram.
@@ -29,6 +32,9 @@ pub(crate) fn open(file: &str, lines: bool) -> Result<Input, Failure> {
         .take(4)
         .read_to_end(&mut start)
         .map_err(reading)?;
+    if start.first_chunk().copied().is_some_and(is_mcap) {
+        return Ok(Input::Mcap(reader));
+    }
     if let Some(magic) = start
         .first_chunk()
         .copied()

@@ -1,5 +1,10 @@
-//! Reads the datagrams of a recording.
+//! Reads the datagrams of a recording: a capture, or an MCAP file with values.
 
+mod json;
+mod mcap;
+mod values;
+
+use std::collections::BTreeMap;
 use std::io::Read;
 use std::net::SocketAddr;
 use std::path::Path;
@@ -9,9 +14,23 @@ use crate::exit::Failure;
 use crate::input::{self, Input};
 use crate::packet::{self, Found, Fragments};
 
+pub(crate) use self::mcap::is_mcap;
+pub(crate) use self::values::Unusable;
+use self::values::Values;
+
 /// Reads the NetworkMessages of a recording.
 pub(crate) struct Recorded {
     name: String,
+    source: Source,
+}
+
+enum Source {
+    Packets(Packets),
+    Values(Box<Values<Box<dyn Read>>>),
+}
+
+/// The packets of a capture.
+struct Packets {
     capture: Capture<Box<dyn Read>>,
     fragments: Fragments,
     /// The time of the last message.
@@ -19,6 +38,7 @@ pub(crate) struct Recorded {
 }
 
 /// A recorded datagram.
+#[derive(Debug)]
 pub(crate) struct Datagram {
     /// Nanoseconds since 1970.
     pub(crate) time: i128,
@@ -27,33 +47,58 @@ pub(crate) struct Datagram {
 }
 
 impl Recorded {
-    /// Opens a capture.
+    /// Opens a capture, or an MCAP file of `ua-space record`.
     ///
     /// # Errors
-    /// A [`Failure`] if the file cannot be read or is no capture.
+    /// A [`Failure`] if the file cannot be read or is no recording.
     pub(crate) fn open(file: &Path) -> Result<Self, Failure> {
         let name = file.display().to_string();
-        match input::open(&name, false)? {
-            Input::Capture(capture) => Ok(Self {
-                name,
+        let source = match input::open(&name, false)? {
+            Input::Capture(capture) => Source::Packets(Packets {
                 capture,
                 fragments: Fragments::default(),
                 time: 0,
             }),
-            Input::Datagram(_) | Input::Lines(_) => Err(Failure::Data(format!(
-                "{name} is no pcapng or pcap file; `ua-space record` makes one"
-            ))),
-        }
+            Input::Mcap(reader) => {
+                let values = Values::new(reader).map_err(|error| input::failure(&name, error))?;
+                Source::Values(Box::new(values))
+            }
+            Input::Datagram(_) | Input::Lines(_) => {
+                return Err(Failure::Data(format!(
+                    "{name} is no pcapng, pcap or MCAP file; `ua-space record` makes one"
+                )));
+            }
+        };
+        Ok(Self { name, source })
     }
 
-    /// Returns the next UDP datagram that was captured as a whole.
+    /// Returns the next datagram: a UDP datagram that was captured as a whole, or a value of an
+    /// MCAP file.
     pub(crate) fn next(&mut self) -> Result<Option<Datagram>, Failure> {
-        loop {
-            let packet = self.capture.next_packet();
-            let packet = packet.map_err(|error| input::failure(&self.name, error))?;
-            let Some(packet) = packet else {
-                return Ok(None);
-            };
+        let next = match &mut self.source {
+            Source::Packets(packets) => packets.next(),
+            Source::Values(values) => values.next(),
+        };
+        next.map_err(|error| input::failure(&self.name, error))
+    }
+
+    /// Returns whether the recording has values only, without security.
+    pub(crate) const fn has_only_values(&self) -> bool {
+        matches!(self.source, Source::Values(_))
+    }
+
+    /// Returns the numbers of values so far that cannot be sent again, by reason.
+    pub(crate) fn unusable(&self) -> BTreeMap<Unusable, u64> {
+        match &self.source {
+            Source::Packets(_) => BTreeMap::new(),
+            Source::Values(values) => values.unusable().clone(),
+        }
+    }
+}
+
+impl Packets {
+    fn next(&mut self) -> Result<Option<Datagram>, crate::capture::CaptureError> {
+        while let Some(packet) = self.capture.next_packet()? {
             self.time = packet.time.unwrap_or(self.time);
             let found = packet::udp(packet.link_type, &packet.data, &mut self.fragments);
             if let Found::Udp(udp) = found
@@ -66,5 +111,6 @@ impl Recorded {
                 }));
             }
         }
+        Ok(None)
     }
 }

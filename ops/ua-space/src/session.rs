@@ -22,6 +22,7 @@ pub(crate) fn decode(arguments: &Decode) -> Result<(), Failure> {
     let context = context(&arguments.known)?;
     let input = input::open(&arguments.file, arguments.lines)?;
     let style = match &input {
+        Input::Mcap(_) => return Err(no_datagrams(name)),
         _ if arguments.array => Style::Array,
         Input::Datagram(_) => Style::Single,
         Input::Lines(_) | Input::Capture(_) => Style::Lines,
@@ -38,6 +39,13 @@ pub(crate) fn decode(arguments: &Decode) -> Result<(), Failure> {
     session.tell();
     let finished = session.report.finish();
     ended.and(finished)
+}
+
+/// Returns the failure for a file with values only.
+fn no_datagrams(name: &str) -> Failure {
+    Failure::Data(format!(
+        "{name} is an MCAP file, which has values and no datagrams\n  = help: `ua-space replay --dry-run {name}` shows its topics; `ua-space record` writes datagrams as .pcapng"
+    ))
 }
 
 /// Runs `ua-space encode`.
@@ -126,6 +134,7 @@ impl Session<'_> {
                 Ok(())
             }
             Input::Capture(capture) => self.capture(capture),
+            Input::Mcap(_) => Err(no_datagrams(self.name)),
         }
     }
 

@@ -31,7 +31,7 @@ pub(crate) struct Record {
 
 #[derive(Debug, Args)]
 pub(crate) struct Replay {
-    /// A recording of `ua-space record`, or another capture of pcap or pcapng
+    /// A recording of `ua-space record`, .pcapng or .mcap, or another capture of pcap or pcapng
     #[arg(value_name = "FILE")]
     pub(crate) file: PathBuf,
     /// How many times faster than it was recorded

@@ -100,7 +100,13 @@ pub(crate) enum News<'a> {
     /// A response of an Action, and its sender.
     Response(ActionMessage<'a>, SocketAddr),
     /// The new or changed announcement of a topic or call, and its sender.
-    Announced(TopicId, Kind, &'a Arc<Described>, SocketAddr),
+    Announced {
+        topic: TopicId,
+        kind: Kind,
+        described: &'a Arc<Described>,
+        from: SocketAddr,
+        announcement: &'a Announcement<'a>,
+    },
 }
 
 /// A DataSetMessage of a topic.
@@ -464,8 +470,14 @@ impl Book {
         });
         match (topic, described) {
             (Some(topic), Some(Ok(described))) => {
-                if let Some(news) = self.keep((topic, kind, from), described, now) {
-                    each(News::Announced(topic, kind, &news, from));
+                if let Some(described) = self.keep((topic, kind, from), described, now) {
+                    each(News::Announced {
+                        topic,
+                        kind,
+                        described: &described,
+                        from,
+                        announcement,
+                    });
                 }
             }
             // The publisher does not have the item, or has removed it.

@@ -144,11 +144,17 @@ impl Asking<'_> {
         let mut found = self.announced(topic);
         if found.is_none() {
             let mut each = |news: News<'_>, _| match news {
-                News::Announced(of, Kind::Call, described, from) if of == topic => {
+                News::Announced {
+                    topic: of,
+                    kind: Kind::Call,
+                    described,
+                    from,
+                    ..
+                } if of == topic => {
                     found = Some((Arc::clone(described), from));
                     Go::Enough
                 }
-                News::Announced(..) | News::Sample(_) | News::Response(..) => Go::On,
+                News::Announced { .. } | News::Sample(_) | News::Response(..) => Go::On,
             };
             if self.live.listen(end, &mut each).await? == Ended::Interrupted {
                 return Err(Failure::Interrupted);
@@ -439,7 +445,7 @@ impl Asking<'_> {
                         steps.extend(run.handle(places, (sample.topic, &value), now));
                     }
                 }
-                News::Sample(_) | News::Announced(..) => {}
+                News::Sample(_) | News::Announced { .. } => {}
             }
             if steps.is_empty() { Go::On } else { Go::Enough }
         };

@@ -188,15 +188,14 @@ impl Channels {
     /// Returns the ROS message of a value; `None` if its definition is not known.
     fn ros(&mut self, topic: TopicId, described: &Described) -> Option<Ros> {
         let name: TypeName = described.ros_type()?.parse().ok()?;
-        let told = described.description.split(';').next().unwrap_or_default();
-        let bytes = told.trim_end().ends_with(AS_BYTES);
+        let bytes = described.is_bytes();
         let found = match bytes && topic.space == SpaceId::ROS1 {
             true => self.ros1.find(&name).ok(),
             false => self.ros2.find(&name).ok(),
         };
         let form = found.as_ref().and_then(|message| match bytes {
             true => Some(Form::Bytes),
-            false => plan(message, &name, described),
+            false => ros_plan(message, &name, described).map(|plan| Form::Ros(Box::new(plan))),
         });
         match (found, form) {
             (Some(message), Some(form)) => Some(Ros { message, form }),
@@ -255,6 +254,11 @@ struct Ros {
 }
 
 impl Channel {
+    /// Returns whether the channel has values with a description.
+    pub(super) const fn is_described(&self) -> bool {
+        self.described.is_some()
+    }
+
     /// Appends the message of a value to `out`.
     ///
     /// # Errors
@@ -308,7 +312,11 @@ fn is_same(known: Option<&Arc<Described>>, described: Option<&Arc<Described>>) -
 }
 
 /// Returns the conversion of the announced fields to the message; `None` if they do not form it.
-fn plan(message: &Arc<MessageType>, name: &TypeName, described: &Described) -> Option<Form> {
+pub(crate) fn ros_plan(
+    message: &Arc<MessageType>,
+    name: &TypeName,
+    described: &Described,
+) -> Option<Plan> {
     let fields = described.fields().iter().map(leaf);
     let of_writer = bridge_core::Described {
         message_type: name.clone(),
@@ -318,8 +326,7 @@ fn plan(message: &Arc<MessageType>, name: &TypeName, described: &Described) -> O
         fields: fields.collect::<Option<_>>()?,
     };
     let selection: Selection = of_writer.selection(message)?;
-    let plan = Plan::compile(message, &selection, Wire::Cdr).ok()?;
-    Some(Form::Ros(Box::new(plan)))
+    Plan::compile(message, &selection, Wire::Cdr).ok()
 }
 
 fn leaf(field: &Field) -> Option<Leaf> {
@@ -390,10 +397,10 @@ const fn kind(builtin: BuiltinType) -> &'static str {
 
 /// Time that values wait for the description of their topic.
 pub(super) const DESCRIBED_WITHIN: Duration = Duration::from_millis(1500);
-/// The end of the description of a message as on the wire.
-const AS_BYTES: &str = " as bytes";
 /// The member of a JSON value with only some of its fields.
-const DELTA: &str = "$delta";
+pub(crate) const DELTA: &str = "$delta";
+/// The key of the metadata of a recorded channel with the announcement of its topic, in Base64.
+pub(crate) const ANNOUNCEMENT: &str = "announcement";
 const MOST_UNKNOWN: usize = 64;
 /// Maximum number of channels of a topic, one for each of its descriptions.
 const MOST_OF_TOPIC: usize = 8;

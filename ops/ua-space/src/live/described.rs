@@ -171,6 +171,12 @@ impl Described {
         is_type.then_some(first)
     }
 
+    /// Returns whether the only field is a message as on the wire.
+    pub(crate) fn is_bytes(&self) -> bool {
+        let kind = self.description.split(';').next().unwrap_or_default();
+        kind.trim_end().ends_with(AS_BYTES)
+    }
+
     /// Returns the name and namespace of the SkillType from the description of a state, as
     /// `GraspSkillType nsu=urn:ua-bridge:skills`.
     pub(crate) fn skill_type(&self) -> Option<(&str, &str)> {
@@ -309,7 +315,7 @@ pub(crate) fn list(fields: &[Field]) -> String {
 }
 
 /// Returns the topic at the beginning of a name.
-pub(super) fn topic_of(name: Option<&str>) -> Option<TopicId> {
+pub(crate) fn topic_of(name: Option<&str>) -> Option<TopicId> {
     name?.split(' ').next()?.parse().ok()
 }
 
@@ -443,6 +449,8 @@ fn bounded(text: Option<&str>, what: &'static str) -> Result<String, &'static st
     }
 }
 
+/// The end of the description of a message as on the wire.
+const AS_BYTES: &str = " as bytes";
 /// The property of the first field with the ROS topics, each as `1 /joint_states`.
 const ROS_TOPICS: &str = "RosTopics";
 /// The property of the first field of a value that acts where it arrives.

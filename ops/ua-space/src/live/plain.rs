@@ -143,7 +143,8 @@ fn field(value: &Variant<'_>, fields: &[Field], index: usize) -> Result<Value, D
     }
 }
 
-fn name(fields: &[Field], index: usize) -> String {
+/// Returns the announced name of a field, or `field_1` and so on.
+pub(crate) fn name(fields: &[Field], index: usize) -> String {
     match fields.get(index) {
         Some(field) if !field.name.is_empty() => field.name.clone(),
         Some(_) | None => format!("{UNNAMED}{}", index + 1),

@@ -151,9 +151,7 @@ impl Recording {
             match live.receive(end.min(now + LOOK)).await? {
                 Incoming::Interrupted => return Ok(()),
                 Incoming::Nothing => {}
-                Incoming::Message(Received { length, from }) => {
-                    self.add(live, (length, from))?;
-                }
+                Incoming::Message(received) => self.add(live, &received)?,
             }
         }
     }
@@ -167,7 +165,7 @@ impl Recording {
             match live.receive(end).await? {
                 Incoming::Interrupted => return Ok(()),
                 Incoming::Nothing => {}
-                Incoming::Message(Received { length, from }) => self.add(live, (length, from))?,
+                Incoming::Message(received) => self.add(live, &received)?,
             }
         }
         Ok(())
@@ -181,11 +179,12 @@ impl Recording {
     }
 
     /// Adds the message in the buffer. Own probes are no part of the cell.
-    fn add(&mut self, live: &mut Live, (length, from): (usize, SocketAddr)) -> Result<(), Failure> {
+    fn add(&mut self, live: &mut Live, received: &Received) -> Result<(), Failure> {
+        let Received { length, from, .. } = *received;
         if live.is_own(from) {
             return Ok(());
         }
-        let now = live.now();
+        let now = live.arrived(received);
         let time = live.utc(now);
         let datagram = live.buffer.get(..length).unwrap_or_default();
         let read = (&mut live.book, live.sealing.as_mut());
@@ -209,11 +208,17 @@ impl Recording {
                         News::Sample(sample) if !is_over && is_value(&sample.message) => {
                             values.add(sample, (now, time))
                         }
-                        News::Announced(topic, Kind::Value, described, _) => {
-                            values.described(*topic, described, now);
+                        News::Announced {
+                            topic,
+                            kind: Kind::Value,
+                            described,
+                            announcement,
+                            ..
+                        } => {
+                            values.described((*topic, announcement), described, now);
                             return Go::On;
                         }
-                        News::Sample(_) | News::Announced(..) | News::Response(..) => {
+                        News::Sample(_) | News::Announced { .. } | News::Response(..) => {
                             return Go::On;
                         }
                     };

@@ -80,7 +80,15 @@ fn plan(contents: &Contents) -> Result<(), Failure> {
     }
     let mut out = io::stdout().lock();
     table.write(&mut out, is_coloured())?;
+    warn_unusable(contents);
     Ok(())
+}
+
+/// Reports the values of an MCAP file that cannot be sent again.
+fn warn_unusable(contents: &Contents) {
+    for (why, count) in &contents.unusable {
+        warn(&format!("{count} left out: {}", why.label()));
+    }
 }
 
 /// Looks for live programs of the spaces.
@@ -171,6 +179,8 @@ impl<'a> Replaying<'a> {
             let since = Duration::from_nanos(u64::try_from(since).unwrap_or_default());
             self.wait(live, self.begin + since).await?;
             datagram::move_times(&mut plain, &self.clock);
+            // A recording of values has no security; with keys its values are secured again.
+            let secured = secured || recorded.has_only_values();
             if self.send(live, (&plain, secured)).await {
                 self.sent += 1;
             }
@@ -201,7 +211,7 @@ impl<'a> Replaying<'a> {
     async fn take(
         &mut self,
         live: &mut Live,
-        Received { length, from }: Received,
+        Received { length, from, .. }: Received,
     ) -> Result<(), Failure> {
         if live.is_own(from) {
             return Ok(());
@@ -303,12 +313,15 @@ impl<'a> Replaying<'a> {
         let mut out = io::stdout().lock();
         if arguments.json {
             let left_out = self.left_out.iter();
+            let left_out = left_out.map(|(why, count)| (why.label(), *count));
+            let unusable = self.contents.unusable.iter();
+            let unusable = unusable.map(|(why, count)| (why.label(), *count));
             let shown = Shown {
                 file: &file,
                 sent: self.sent,
                 seconds,
                 unsent: self.unsent,
-                left_out: left_out.map(|(why, count)| (why.label(), *count)).collect(),
+                left_out: left_out.chain(unusable).collect(),
             };
             writeln!(out, "{}", json(&shown)?)?;
             return Ok(());
@@ -317,6 +330,7 @@ impl<'a> Replaying<'a> {
         for (why, count) in &self.left_out {
             warn(&format!("{count} left out: {}", why.label()));
         }
+        warn_unusable(self.contents);
         if self.unsent > 0 {
             warn(&format!(
                 "{} not sent: the network did not take them",

@@ -70,8 +70,13 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
 fn take(news: &News<'_>, (channels, hub): (&mut Channels, &Hub), (start, now): (i128, Duration)) {
     let (topic, described) = match news {
         News::Sample(sample) => (sample.topic, sample.described.as_ref()),
-        News::Announced(topic, Kind::Value, described, _) => (*topic, Some(*described)),
-        News::Announced(..) | News::Response(..) => return,
+        News::Announced {
+            topic,
+            kind: Kind::Value,
+            described,
+            ..
+        } => (*topic, Some(*described)),
+        News::Announced { .. } | News::Response(..) => return,
     };
     let channel = match channels.channel(topic, described, now) {
         Ok(channel) => channel,

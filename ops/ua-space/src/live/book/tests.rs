@@ -224,7 +224,13 @@ fn a_call_is_known_by_its_name_with_what_may_be_left_out_of_it() {
     for port in [1, 1, 2] {
         let message = NetworkMessage::decode(&datagram).unwrap();
         book.handle((&message, from(port)), NOW, &mut |news| {
-            if let News::Announced(topic, kind, described, _) = news {
+            if let News::Announced {
+                topic,
+                kind,
+                described,
+                ..
+            } = news
+            {
                 heard.push((topic, kind, described.summary()));
             }
         });

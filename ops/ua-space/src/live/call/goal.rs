@@ -235,7 +235,13 @@ impl Asking<'_> {
         }
         let end = until(self.live.now(), Some(self.arguments.wait));
         let mut each = |news: News<'_>, _| {
-            if let News::Announced(topic, kind, described, from) = news
+            if let News::Announced {
+                topic,
+                kind,
+                described,
+                from,
+                ..
+            } = news
                 && executor.publishes(from)
             {
                 take(&mut found, parts, (topic, kind), described);
@@ -374,7 +380,7 @@ impl Asking<'_> {
                         told.push(Told::Feedback { fields });
                     }
                 }
-                News::Sample(_) | News::Announced(..) => {}
+                News::Sample(_) | News::Announced { .. } => {}
             }
             match told.is_empty() && came.is_none() {
                 true => Go::On,

@@ -3,7 +3,10 @@
 
 use std::collections::BTreeMap;
 
-use crate::live::channels::Channel;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD as BASE64;
+
+use crate::live::channels::{ANNOUNCEMENT, Channel};
 
 /// Encodes the records of a file.
 #[derive(Debug, Default)]
@@ -57,8 +60,9 @@ impl Mcap {
         Self::default()
     }
 
-    /// Adds a channel with its schema to the current chunk.
-    pub(super) fn channel(&mut self, channel: &Channel) {
+    /// Adds a channel with its schema to the current chunk, and the announcement of its topic, with
+    /// which its values can be sent again.
+    pub(super) fn channel(&mut self, channel: &Channel, announcement: Option<&[u8]>) {
         let mut schema = Vec::new();
         record(SCHEMA, &mut schema, |out| {
             out.extend(channel.id.to_le_bytes());
@@ -77,6 +81,10 @@ impl Mcap {
                 for (key, value) in &channel.metadata {
                     text(key, out);
                     text(value, out);
+                }
+                if let Some(announcement) = announcement {
+                    text(ANNOUNCEMENT, out);
+                    text(&BASE64.encode(announcement), out);
                 }
             });
         });

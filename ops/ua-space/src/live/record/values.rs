@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use mappings::TopicId;
+use uadp::discovery::Announcement;
 use uadp::{
     DataSetMessage, FieldEncoding, MessageKind, NetworkHeader, NetworkMessage,
     NetworkMessageEncoder,
@@ -13,6 +14,7 @@ use uadp::{
 use super::mcap::{Mcap, Message};
 use super::sink::Sink;
 use crate::exit::Failure;
+use crate::live::announcements::Announcements;
 use crate::live::book::Sample;
 use crate::live::channels::{Channel, Channels, DESCRIBED_WITHIN, Unfit};
 use crate::live::described::Described;
@@ -29,6 +31,8 @@ pub(super) struct Values {
     part: Vec<u8>,
     /// Values that wait for the description of their topic.
     waiting: VecDeque<Waiting>,
+    /// The newest announcement of each topic, as a NetworkMessage.
+    announcements: Announcements,
     /// The size of all waiting values.
     weight: usize,
     left_out: BTreeMap<Unfit, u64>,
@@ -63,6 +67,7 @@ impl Values {
             written: BTreeSet::new(),
             part,
             waiting: VecDeque::new(),
+            announcements: Announcements::default(),
             weight: 0,
             left_out: BTreeMap::new(),
             scratch: Vec::new(),
@@ -84,7 +89,7 @@ impl Values {
         match self.channels.channel(sample.topic, described, now) {
             Ok(channel) => {
                 self.release(sample.topic, &channel);
-                self.write(&channel, times, &sample.message);
+                self.write((sample.topic, &channel), times, &sample.message);
             }
             Err(Unfit::Undescribed) => self.hold(sample, times, now),
             Err(unfit) => self.leave_out(unfit),
@@ -92,8 +97,14 @@ impl Values {
         Ok(true)
     }
 
-    /// Records the waiting values of a topic whose description has arrived.
-    pub(super) fn described(&mut self, topic: TopicId, described: &Arc<Described>, now: Duration) {
+    /// Keeps the announcement of a topic, and records the values that wait for it.
+    pub(super) fn described(
+        &mut self,
+        (topic, announcement): (TopicId, &Announcement<'_>),
+        described: &Arc<Described>,
+        now: Duration,
+    ) {
+        self.announcements.keep(topic, announcement);
         if self.waiting.iter().any(|waiting| waiting.topic == topic)
             && let Ok(channel) = self.channels.channel(topic, Some(described), now)
         {
@@ -154,13 +165,20 @@ impl Values {
         self.sink.finish(self.part)
     }
 
-    fn write(&mut self, channel: &Channel, times: Times, message: &DataSetMessage<'_>) {
+    fn write(
+        &mut self,
+        (topic, channel): (TopicId, &Channel),
+        times: Times,
+        message: &DataSetMessage<'_>,
+    ) {
         self.scratch.clear();
         let mut data = std::mem::take(&mut self.scratch);
         match channel.encode(message, &mut data) {
             Ok(()) => {
                 if self.written.insert(channel.id) {
-                    self.writer.channel(channel);
+                    let announcement = self.announcements.get(topic);
+                    let announcement = announcement.filter(|_| channel.is_described());
+                    self.writer.channel(channel, announcement);
                 }
                 self.writer.message(&Message {
                     channel: channel.id,
@@ -208,7 +226,7 @@ impl Values {
             let message = NetworkMessage::decode(&waiting.datagram).ok();
             let message = message.and_then(|message| message.messages().next()?.ok());
             match message {
-                Some(message) => self.write(channel, waiting.times, &message),
+                Some(message) => self.write((topic, channel), waiting.times, &message),
                 None => self.leave_out(Unfit::Mismatch),
             }
         }
@@ -253,3 +271,6 @@ const CHUNK: usize = 1 << 20;
 /// Maximum number and size of values that wait for descriptions.
 const MOST_WAITING: usize = 10_000;
 const MOST_WEIGHT: usize = 16 << 20;
+
+#[cfg(test)]
+mod tests;

@@ -1,23 +1,21 @@
 //! The contents of a recording, and the messages in it that are sent again.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use mappings::{Motion, SpaceId, TopicId};
 use uadp::discovery::{Announced, Announcement};
-use uadp::{
-    NetworkMessage, NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, SecurityHeader,
-};
+use uadp::{NetworkMessage, NetworkMessageType, PublisherId};
 
 use super::datagram;
 use crate::arguments::Replay;
 use crate::exit::Failure;
+use crate::live::announcements::Announcements;
 use crate::live::book::{BAD, Book, Kind, News};
 use crate::live::described::{Described, topic_of};
 use crate::live::sealing::Sealing;
-use crate::recorded::Recorded;
+use crate::recorded::{Recorded, Unusable};
 
 /// The reason why a message is not sent again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -82,10 +80,9 @@ pub(super) struct Contents {
     book: Book,
     /// The first description of each topic, and one that acts.
     descriptions: BTreeMap<TopicId, Vec<Arc<Described>>>,
-    /// The newest announcement of each topic.
-    announcements: BTreeMap<TopicId, Vec<u8>>,
-    /// The size of all announcements.
-    weight: usize,
+    announcements: Announcements,
+    /// Values of an MCAP file that cannot be sent again.
+    pub(super) unusable: BTreeMap<Unusable, u64>,
 }
 
 impl Contents {
@@ -101,10 +98,9 @@ impl Contents {
             first: i128::MAX,
             book: Book::new(),
             descriptions: BTreeMap::new(),
-            announcements: BTreeMap::new(),
-            weight: 0,
+            announcements: Announcements::default(),
+            unusable: BTreeMap::new(),
         };
-        let mut reassembler = Reassembler::new(ReassemblyLimits::default());
         let mut scratch = Vec::new();
         while let Some(datagram) = recorded.next()? {
             let Ok(message) = NetworkMessage::decode(&datagram.bytes) else {
@@ -123,45 +119,12 @@ impl Contents {
             };
             let from = datagram.from;
             let descriptions = &mut contents.descriptions;
-            let mut each = |news: News<'_>| describe(descriptions, &news);
+            let announcements = &mut contents.announcements;
+            let mut each = |news: News<'_>| describe((descriptions, announcements), &news);
             contents.book.handle((&message, from), now, &mut each);
-            contents.announcement(&message, (&mut reassembler, from), now);
         }
+        contents.unusable = recorded.unusable();
         Ok(contents)
-    }
-
-    /// Keeps the announcement of a topic.
-    fn announcement(
-        &mut self,
-        message: &NetworkMessage<'_>,
-        (reassembler, from): (&mut Reassembler<SocketAddr>, SocketAddr),
-        now: Duration,
-    ) {
-        if message.message_type() != NetworkMessageType::Announcement || message.is_sealed() {
-            return;
-        }
-        let announcement = match message.is_chunk() {
-            false => Announcement::decode(message).ok(),
-            true => {
-                let whole = reassembler.receive_from(from, message, now).ok().flatten();
-                whole.and_then(|whole| Announcement::decode_body(whole.bytes).ok())
-            }
-        };
-        let Some(announcement) = announcement else {
-            return;
-        };
-        let (Some(topic), Some(publisher)) =
-            (described_topic(&announcement), message.publisher_id())
-        else {
-            return;
-        };
-        let mut datagram = Vec::new();
-        let encoded = announcement.encode(publisher, SecurityHeader::NONE, &mut datagram);
-        if encoded.is_ok() && self.weight + datagram.len() <= MOST_WEIGHT {
-            self.weight += datagram.len();
-            let before = self.announcements.insert(topic, datagram);
-            self.weight -= before.map_or(0, |before| before.len());
-        }
     }
 
     /// Returns the topics with the number of their values, and the reason why they are left out.
@@ -195,8 +158,7 @@ impl Contents {
     /// Returns the announcements of the topics that are sent.
     pub(super) fn announcements(&self) -> impl Iterator<Item = (TopicId, &[u8])> {
         let all = self.announcements.iter();
-        let sent = all.filter(|(topic, _)| self.left_out(**topic).is_none());
-        sent.map(|(topic, datagram)| (*topic, datagram.as_slice()))
+        all.filter(|(topic, _)| self.left_out(*topic).is_none())
     }
 
     fn is_wanted(&self, space: SpaceId) -> bool {
@@ -328,12 +290,27 @@ fn moves(name: &str) -> bool {
         || matches!(own, "JointJog" | "MultiDOFJointTrajectory")
 }
 
-/// Keeps the first description of a topic, and the first that acts. Values of a topic act if one of
-/// its writers said so at any time: a mapping changes, and a program ends.
-fn describe(descriptions: &mut BTreeMap<TopicId, Vec<Arc<Described>>>, news: &News<'_>) {
-    let News::Announced(topic, Kind::Value, described, _) = news else {
+/// Keeps the newest announcement of a topic, its first description, and the first description that
+/// acts. Values of a topic act if one of its writers said so at any time: a mapping changes, and a
+/// program ends.
+fn describe(
+    (descriptions, announcements): (
+        &mut BTreeMap<TopicId, Vec<Arc<Described>>>,
+        &mut Announcements,
+    ),
+    news: &News<'_>,
+) {
+    let News::Announced {
+        topic,
+        kind: Kind::Value,
+        described,
+        announcement,
+        ..
+    } = news
+    else {
         return;
     };
+    announcements.keep(*topic, announcement);
     let all = descriptions.entry(*topic).or_default();
     if all.is_empty() || (acts(described) && !all.iter().any(|one| acts(one))) {
         all.push(Arc::clone(described));
@@ -364,6 +341,3 @@ pub(super) fn space(message: &NetworkMessage<'_>) -> Option<SpaceId> {
         | PublisherId::String(_) => None,
     }
 }
-
-/// Maximum size of all announcements.
-const MOST_WEIGHT: usize = 32 << 20;
