@@ -269,6 +269,47 @@ variables:
     });
 }
 
+#[test]
+fn users_of_other_hosts_sign_in_by_tls_with_the_certificate_of_the_server() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    add_user(&cell, "anna", "operator");
+    let _server = cell.ua_server(&["--page-tls", "127.0.0.1:9443"]);
+    let pki = cell.folder().join("pki");
+    let certificate = pki.join("own/cert.der");
+    let words = ["9443", certificate.to_str().unwrap(), PASSWORD];
+    let seen = cell.asyncua_once("page_tls.py", &words);
+    let of = |name: &str| {
+        let found = seen.iter().find(|line| line["name"] == name);
+        found.cloned().unwrap_or(Value::Null)
+    };
+    assert_eq!(of("clear")["page"], false, "{seen:?}");
+    assert_eq!(of("stranger")["trusted"], false, "{seen:?}");
+    for (name, code) in [
+        ("start", 200),
+        ("session", 200),
+        ("unknown reader", 401),
+        ("other site", 421),
+        ("status", 404),
+        ("wrong password", 403),
+        ("sign-in", 200),
+        ("reader", 200),
+    ] {
+        assert_eq!(of(name)["code"], code, "{name}: {seen:?}");
+    }
+    assert_eq!(of("session")["text"]["must_sign_in"], true);
+    assert_eq!(of("sign-in")["text"]["user"], "anna");
+    let cookie = of("sign-in")["cookie"].to_string();
+    assert!(cookie.contains("__Host-ua-session="), "{cookie}");
+    assert!(cookie.contains("; Secure"), "{cookie}");
+    // On this host without TLS, everybody may read as before.
+    assert_eq!(
+        Browser::of(METRICS_SERVER).get("/session").json()["must_sign_in"],
+        false
+    );
+}
+
 const ALARMS: &str = "
 namespaces:
   2: urn:ua-bridge:system-tests

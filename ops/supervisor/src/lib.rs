@@ -8,7 +8,7 @@
 //! `program` (rows of programs), `skill` (tiles of skills), `timeline` (events), `view` (what a
 //! browser is sent), `stream` (server-sent events), `fetch` (the status of other programs), `page`
 //! (state and events), `session` (signed-in users), `encode` (forms), `operations` (commands),
-//! `proxy`, `responses` and `site` (requests).
+//! `proxy`, `tls`, `responses` and `site` (requests).
 
 mod announced;
 mod board;
@@ -24,6 +24,7 @@ mod site;
 mod skill;
 mod stream;
 mod timeline;
+mod tls;
 mod value;
 mod view;
 
@@ -33,3 +34,4 @@ pub use operations::{
 };
 pub use page::{Page, Recorded};
 pub use proxy::{ProxyUrl, ProxyUrlError};
+pub use tls::Pair;

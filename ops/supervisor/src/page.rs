@@ -23,6 +23,7 @@ use crate::proxy::ProxyUrl;
 use crate::session::Sessions;
 use crate::stream::Worker;
 use crate::timeline;
+use crate::tls::Resolver;
 use crate::view::Viewer;
 
 /// The page of a program.
@@ -31,6 +32,8 @@ pub struct Page {
     pub(crate) program: &'static str,
     /// The reverse proxy through which browsers reach the page, if there is one.
     pub(crate) proxy: Option<ProxyUrl>,
+    /// The certificate of the page for browsers of other hosts, if it is served by TLS.
+    pub(crate) tls: OnceLock<Arc<Resolver>>,
     /// The users and the commands of the program, if it has any.
     pub(crate) operations: OnceLock<Arc<dyn Operations>>,
     pub(crate) sessions: Mutex<Sessions>,
@@ -67,6 +70,7 @@ impl Page {
         Arc::new(Self {
             program,
             proxy,
+            tls: OnceLock::new(),
             operations: OnceLock::new(),
             sessions: Mutex::default(),
             board: Mutex::default(),

@@ -102,6 +102,14 @@ impl Sessions {
     }
 }
 
+/// The browser of an event stream.
+#[derive(Debug)]
+pub(crate) struct Reader {
+    pub(crate) token: String,
+    /// Whether only a signed-in user may read.
+    pub(crate) must_sign_in: bool,
+}
+
 /// Returns the value of a cookie in the Cookie header.
 pub(crate) fn cookie<'h>(header: &'h str, name: &str) -> Option<&'h str> {
     let mut pairs = header.split(';').take(MOST_COOKIES);

@@ -22,9 +22,8 @@ use tracing::{info, warn};
 use crate::encode;
 use crate::operations::{ConditionChange, OperationFault, Operations};
 use crate::page::Page;
-use crate::proxy::ProxyUrl;
 use crate::responses::{FILES, json_page, refused, set_cookie, with_headers};
-use crate::session::{Session, cookie};
+use crate::session::{Reader, Session, cookie};
 use crate::stream::Events;
 use crate::value;
 use crate::view::View;
@@ -32,8 +31,32 @@ use crate::view::View;
 /// The origin of a request: its Host, and its session.
 struct Browser {
     host: String,
+    via: Via,
     session: Option<Session>,
     token: String,
+}
+
+/// The way of a request to the page.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Via {
+    /// From this host, without TLS.
+    Loopback,
+    /// Through the reverse proxy, or from this host while there is a proxy: a proxy may pass on the
+    /// name of loopback.
+    Proxy,
+    /// By TLS of the page itself.
+    Tls,
+}
+
+impl Via {
+    /// Returns whether browsers of other hosts use this way: each user signs in, also to read, and
+    /// the browser has TLS.
+    const fn is_remote(self) -> bool {
+        match self {
+            Self::Loopback => false,
+            Self::Proxy | Self::Tls => true,
+        }
+    }
 }
 
 /// The body of a request to sign in.
@@ -106,11 +129,11 @@ impl Page {
         request: Request<Incoming>,
         visit: &Visit,
     ) -> Result<Response<PageBody>, Refusal> {
-        let host = self.host(request.headers(), visit.peer)?;
+        let (host, via) = self.host(request.headers(), visit)?;
         let path = request.uri().path().to_owned();
         if request.method() == Method::POST {
-            check_origin(request.headers(), &host, self.proxy.as_ref())?;
-            let browser = self.browser(request.headers(), host);
+            check_origin(request.headers(), &self.origin(&host, via))?;
+            let browser = self.browser(request.headers(), (host, via));
             return self.change(&path, request, browser, visit).await;
         }
         if request.method() != Method::GET {
@@ -122,11 +145,11 @@ impl Page {
         if let Some((_, media, content)) = FILES.iter().find(|(name, ..)| *name == path) {
             return Ok(with_headers(media, full(content.as_bytes())));
         }
-        let browser = self.browser(request.headers(), host);
+        let browser = self.browser(request.headers(), (host, via));
         match path.as_str() {
-            "/session" => Ok(json_page(&self.told(browser.session.as_ref()))),
+            "/session" => Ok(json_page(&self.told(browser.session.as_ref(), via))),
             "/events" => {
-                self.check_reader(&browser)?;
+                check_reader(&browser)?;
                 let query = request.uri().query().unwrap_or_default();
                 let view =
                     View::parse(query).map_err(|why| Refusal::new(StatusCode::BAD_REQUEST, why))?;
@@ -135,7 +158,11 @@ impl Page {
                     Refusal::new(StatusCode::SERVICE_UNAVAILABLE, why)
                 })?;
                 visit.keep_open();
-                let events = Events::start(worker, Arc::clone(&self), view, browser.token);
+                let reader = Reader {
+                    token: browser.token,
+                    must_sign_in: via.is_remote(),
+                };
+                let events = Events::start(worker, Arc::clone(&self), view, reader);
                 Ok(with_headers("text/event-stream", events.boxed_unsync()))
             }
             _ => Err(Refusal::new(
@@ -183,8 +210,8 @@ impl Page {
             "/sign-out" => {
                 self.sessions().close(&browser.token);
                 info!(user = session.user, "signed out of the page");
-                let mut response = json_page(&self.told(None));
-                let expired = self.cookie(&browser.host, "", 0);
+                let mut response = json_page(&self.told(None, browser.via));
+                let expired = browser.cookie("", 0);
                 set_cookie(&mut response, &expired);
                 Ok(response)
             }
@@ -234,8 +261,8 @@ impl Page {
             sessions.open(&user, [token.clone(), csrf], now)
         };
         info!(user = shown, "signed in on the page");
-        let mut response = json_page(&self.told(Some(&session)));
-        let made = self.cookie(&browser.host, &token, 24 * 3600);
+        let mut response = json_page(&self.told(Some(&session), browser.via));
+        let made = browser.cookie(&token, 24 * 3600);
         set_cookie(&mut response, &made);
         Ok(response)
     }
@@ -304,7 +331,7 @@ impl Page {
     }
 
     /// Returns the session for the browser.
-    fn told(&self, session: Option<&Session>) -> Value {
+    fn told(&self, session: Option<&Session>, via: Via) -> Value {
         let operations = self.operations.get();
         let may_sign_in = operations.is_some_and(|operations| operations.has_users());
         let user = session.and_then(|session| {
@@ -318,7 +345,7 @@ impl Page {
             "program": self.program,
             "version": build_info::version(),
             "may_sign_in": may_sign_in,
-            "must_sign_in": self.proxy.is_some() && user.is_none(),
+            "must_sign_in": via.is_remote() && user.is_none(),
             "may_operate": may_operate,
             "user": user.as_ref().map(|(session, _)| &session.user),
             "roles": user.as_ref().map(|(_, roles)| roles),
@@ -326,13 +353,25 @@ impl Page {
         })
     }
 
-    /// Checks that a request comes from this host and was meant for it, because a page of another
-    /// site can reach loopback by a name that resolves to it. Returns the Host.
-    fn host(&self, headers: &HeaderMap, peer: SocketAddr) -> Result<String, Refusal> {
-        if !peer.ip().to_canonical().is_loopback() {
+    /// Checks that a request was meant for the page, because a page of another site can reach it by
+    /// a name that resolves to its address; without TLS, it comes from this host. Returns the Host
+    /// and the way.
+    fn host(&self, headers: &HeaderMap, visit: &Visit) -> Result<(String, Via), Refusal> {
+        let host = headers.get(HOST).and_then(|host| host.to_str().ok());
+        let host = host.unwrap_or_default();
+        if visit.is_secure {
+            return match self.is_own_name(without_port(host)) {
+                true => Ok((host.to_owned(), Via::Tls)),
+                false => Err(Refusal::new(
+                    StatusCode::MISDIRECTED_REQUEST,
+                    "the page is served by the names in the certificate of the program",
+                )),
+            };
+        }
+        if !visit.peer.ip().to_canonical().is_loopback() {
             return Err(Refusal::new(
                 StatusCode::FORBIDDEN,
-                "the page is for browsers on this host: use an SSH tunnel, or a reverse proxy with --page-proxy",
+                "the page is for browsers on this host: use --page-tls, an SSH tunnel, or a reverse proxy with --page-proxy",
             ));
         }
         // A proxy connects from loopback on behalf of other hosts.
@@ -343,11 +382,13 @@ impl Page {
                 "the request comes through a proxy: name it with --page-proxy, so that users sign in",
             ));
         }
-        let host = headers.get(HOST).and_then(|host| host.to_str().ok());
-        let host = host.unwrap_or_default();
         let is_proxy = self.proxy.as_ref().is_some_and(|proxy| proxy.is_host(host));
         if is_proxy || is_loopback_name(host) {
-            return Ok(host.to_owned());
+            let via = match self.proxy {
+                Some(_) => Via::Proxy,
+                None => Via::Loopback,
+            };
+            return Ok((host.to_owned(), via));
         }
         Err(Refusal::new(
             StatusCode::MISDIRECTED_REQUEST,
@@ -355,8 +396,25 @@ impl Page {
         ))
     }
 
-    fn browser(&self, headers: &HeaderMap, host: String) -> Browser {
-        let name = self.cookie_name(&host);
+    /// Returns whether the certificate of the page has a name or address. An address that it does
+    /// not have is no name of another site either: a browser warns of it.
+    fn is_own_name(&self, name: &str) -> bool {
+        let certificate = self.tls.get();
+        let is_address = name.parse::<IpAddr>().is_ok();
+        is_address || certificate.is_some_and(|certificate| certificate.is_for(name))
+    }
+
+    /// Returns the origin of the requests of the page itself.
+    fn origin(&self, host: &str, via: Via) -> String {
+        match (via, &self.proxy) {
+            (Via::Proxy, Some(proxy)) => proxy.to_string(),
+            (Via::Tls, _) => format!("https://{host}"),
+            (Via::Proxy | Via::Loopback, _) => format!("http://{host}"),
+        }
+    }
+
+    fn browser(&self, headers: &HeaderMap, (host, via): (String, Via)) -> Browser {
+        let name = cookie_name(&host, via);
         let cookies = headers.get(COOKIE).and_then(|value| value.to_str().ok());
         let token = cookies.and_then(|cookies| cookie(cookies, &name));
         let token = token.unwrap_or_default().to_owned();
@@ -369,47 +427,50 @@ impl Page {
         });
         Browser {
             host,
+            via,
             session,
             token,
         }
     }
 
     /// Returns whether the browser of a session may still read.
-    pub(crate) fn may_read(&self, token: &str) -> bool {
-        if self.proxy.is_none() {
+    pub(crate) fn may_read(&self, reader: &Reader) -> bool {
+        if !reader.must_sign_in {
             return true;
         }
         let now = self.at().since;
-        let user = self.sessions().user(token, now);
+        let user = self.sessions().user(&reader.token, now);
         let operations = self.operations.get();
         user.zip(operations)
             .is_some_and(|(user, operations)| operations.roles(&user).is_some())
     }
+}
 
-    /// Checks that a browser may read: on loopback without a proxy every browser may. Behind a
-    /// proxy the Host does not show where a request comes from, so each user signs in.
-    fn check_reader(&self, browser: &Browser) -> Result<(), Refusal> {
-        match self.proxy.is_none() || browser.session.is_some() {
-            true => Ok(()),
-            false => Err(Refusal::new(StatusCode::UNAUTHORIZED, "sign in first")),
-        }
+/// Checks that a browser may read: on loopback without a proxy every browser may. Otherwise the
+/// request may come from any host, so each user signs in.
+fn check_reader(browser: &Browser) -> Result<(), Refusal> {
+    match !browser.via.is_remote() || browser.session.is_some() {
+        true => Ok(()),
+        false => Err(Refusal::new(StatusCode::UNAUTHORIZED, "sign in first")),
     }
+}
 
-    /// Returns the name of the session cookie. Browsers send cookies of loopback to every port, and
-    /// do not accept secure cookies over plain HTTP everywhere, so the name has the port there.
-    fn cookie_name(&self, host: &str) -> String {
-        if self.proxy.is_some() {
-            return "__Host-ua-session".to_owned();
-        }
-        let port = host.rsplit_once(':').map_or("80", |(_, port)| port);
-        format!("ua-session-{port}")
+/// Returns the name of the session cookie. Browsers send cookies of loopback to every port, and do
+/// not accept secure cookies over plain HTTP everywhere, so the name has the port there.
+fn cookie_name(host: &str, via: Via) -> String {
+    if via.is_remote() {
+        return "__Host-ua-session".to_owned();
     }
+    let port = host.rsplit_once(':').map_or("80", |(_, port)| port);
+    format!("ua-session-{port}")
+}
 
-    fn cookie(&self, host: &str, token: &str, max_age: u32) -> String {
-        let name = self.cookie_name(host);
-        let secure = match self.proxy {
-            Some(_) => "; Secure",
-            None => "",
+impl Browser {
+    fn cookie(&self, token: &str, max_age: u32) -> String {
+        let name = cookie_name(&self.host, self.via);
+        let secure = match self.via.is_remote() {
+            true => "; Secure",
+            false => "",
         };
         format!("{name}={token}; Path=/; Max-Age={max_age}; HttpOnly; SameSite=Strict{secure}")
     }
@@ -470,8 +531,8 @@ fn refusal(fault: OperationFault, user: &str) -> Refusal {
     }
 }
 
-/// Refuses requests that the page of another site has sent.
-fn check_origin(headers: &HeaderMap, host: &str, proxy: Option<&ProxyUrl>) -> Result<(), Refusal> {
+/// Refuses requests that the page of another site has sent. `own` is the origin of the page.
+fn check_origin(headers: &HeaderMap, own: &str) -> Result<(), Refusal> {
     let text = |name| {
         headers
             .get(name)
@@ -479,10 +540,7 @@ fn check_origin(headers: &HeaderMap, host: &str, proxy: Option<&ProxyUrl>) -> Re
     };
     let site = text(HeaderName::from_static("sec-fetch-site"));
     let origin = text(ORIGIN);
-    let is_own = origin.is_none_or(|origin| match proxy {
-        Some(proxy) => origin == proxy.to_string(),
-        None => origin == format!("http://{host}"),
-    });
+    let is_own = origin.is_none_or(|origin| origin == own);
     let is_json = text(CONTENT_TYPE).is_some_and(|media| media.starts_with("application/json"));
     if site.is_some_and(|site| site != "same-origin") || !is_own || !is_json {
         return Err(Refusal::new(
@@ -515,12 +573,17 @@ async fn body<T: for<'d> Deserialize<'d>>(request: Request<Incoming>) -> Result<
         .map_err(|error| Refusal::new(StatusCode::BAD_REQUEST, error.to_string()))
 }
 
-fn is_loopback_name(host: &str) -> bool {
+/// Returns the name or address in a Host header.
+fn without_port(host: &str) -> &str {
     let name = match host.rsplit_once(':') {
         Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
         Some(_) | None => host,
     };
-    let name = name.trim_start_matches('[').trim_end_matches(']');
+    name.trim_start_matches('[').trim_end_matches(']')
+}
+
+fn is_loopback_name(host: &str) -> bool {
+    let name = without_port(host);
     name == "localhost"
         || name
             .parse::<IpAddr>()
@@ -557,7 +620,7 @@ mod tests {
     }
 
     fn is_from_page(pairs: &[(&'static str, &'static str)]) -> bool {
-        check_origin(&headers(pairs), "localhost:9100", None).is_ok()
+        check_origin(&headers(pairs), "http://localhost:9100").is_ok()
     }
 
     #[test]
@@ -596,23 +659,24 @@ mod tests {
         assert!(!is_from_page(&[JSON, ("sec-fetch-site", "same-site")]));
         assert!(!is_from_page(&[("content-type", "text/plain")]));
         assert!(!is_from_page(&[]));
-        let proxy: ProxyUrl = "https://cell.example".parse().unwrap();
         for (origin, is_own) in [
             ("https://cell.example", true),
             ("https://evil.example", false),
         ] {
             let sent = headers(&[JSON, ("origin", origin)]);
-            // A proxy may pass on another Host.
-            assert_eq!(
-                check_origin(&sent, "127.0.0.1:9100", Some(&proxy)).is_ok(),
-                is_own
-            );
+            assert_eq!(check_origin(&sent, "https://cell.example").is_ok(), is_own);
         }
+    }
+
+    fn visit(peer: &str, is_secure: bool) -> Visit {
+        let mut visit = Visit::from(peer.parse::<SocketAddr>().unwrap());
+        visit.is_secure = is_secure;
+        visit
     }
 
     #[test]
     fn behind_a_proxy_users_sign_in_and_cookies_are_secure() {
-        let peer: SocketAddr = "127.0.0.1:5000".parse().unwrap();
+        let here = visit("127.0.0.1:5000", false);
         let proxied = Page::new(
             "test",
             Vec::new(),
@@ -620,33 +684,47 @@ mod tests {
         );
         let open = Page::new("test", Vec::new(), None);
         let of_proxy = headers(&[("host", "cell.example")]);
-        assert!(open.host(&of_proxy, peer).is_err());
-        assert!(
-            open.host(
-                &headers(&[("host", "localhost:9100")]),
-                "10.0.0.1:1".parse().unwrap()
-            )
-            .is_err()
-        );
+        assert!(open.host(&of_proxy, &here).is_err());
+        let of_loopback = headers(&[("host", "localhost:9100")]);
+        let there = visit("10.0.0.1:1", false);
+        assert!(open.host(&of_loopback, &there).is_err());
         let forwarded = headers(&[("host", "127.0.0.1:9100"), ("x-forwarded-for", "10.0.0.1")]);
-        assert!(open.host(&forwarded, peer).is_err() && proxied.host(&forwarded, peer).is_ok());
-        let host = proxied.host(&of_proxy, peer).unwrap_or_default();
-        assert_eq!(host, "cell.example");
-        // A proxy may pass on the name of loopback.
-        for host in ["cell.example", "127.0.0.1:9100"] {
-            let browser = proxied.browser(&HeaderMap::new(), host.to_owned());
-            assert!(proxied.check_reader(&browser).is_err());
+        assert!(open.host(&forwarded, &here).is_err());
+        // A proxy may pass on the name of loopback, and another Host.
+        for sent in [&of_proxy, &forwarded] {
+            let (host, via) = proxied.host(sent, &here).ok().unwrap();
+            assert_eq!(proxied.origin(&host, via), "https://cell.example");
+            let browser = proxied.browser(&HeaderMap::new(), (host, via));
+            assert!(check_reader(&browser).is_err());
+            let cookie = browser.cookie("ab", 60);
+            assert!(cookie.starts_with("__Host-ua-session=ab; Path=/;"));
+            assert!(cookie.ends_with("; Secure"));
         }
-        let browser = open.browser(&HeaderMap::new(), "127.0.0.1:9100".to_owned());
-        assert!(open.check_reader(&browser).is_ok());
-        let cookie = proxied.cookie("cell.example", "ab", 60);
-        assert!(
-            cookie.starts_with("__Host-ua-session=ab; Path=/;") && cookie.ends_with("; Secure")
-        );
-        let cookie = open.cookie("127.0.0.1:9100", "ab", 60);
-        assert!(
-            cookie.starts_with("ua-session-9100=ab; Path=/;")
-                && cookie.contains("HttpOnly; SameSite=Strict")
-        );
+        let of_loopback = headers(&[("host", "127.0.0.1:9100")]);
+        let found = open.host(&of_loopback, &here).ok().unwrap();
+        assert_eq!(open.origin(&found.0, found.1), "http://127.0.0.1:9100");
+        let browser = open.browser(&HeaderMap::new(), found);
+        assert!(check_reader(&browser).is_ok());
+        let cookie = browser.cookie("ab", 60);
+        assert!(cookie.starts_with("ua-session-9100=ab; Path=/;"));
+        assert!(cookie.contains("HttpOnly; SameSite=Strict") && !cookie.contains("Secure"));
+    }
+
+    #[test]
+    fn by_tls_users_of_other_hosts_sign_in_and_other_names_are_refused() {
+        let page = Page::new("test", Vec::new(), None);
+        let there = visit("10.0.0.1:5000", true);
+        let of_address = headers(&[("host", "10.0.0.2:9443")]);
+        let found = page.host(&of_address, &there).ok().unwrap();
+        assert_eq!(page.origin(&found.0, found.1), "https://10.0.0.2:9443");
+        let browser = page.browser(&HeaderMap::new(), found);
+        assert!(check_reader(&browser).is_err());
+        assert!(browser.cookie("ab", 60).ends_with("; Secure"));
+        let told = page.told(None, browser.via);
+        assert_eq!(told["must_sign_in"], true);
+        for other in ["evil.example", "", "localhost.evil.example"] {
+            let sent = headers(&[("host", other)]);
+            assert!(page.host(&sent, &there).is_err(), "{other}");
+        }
     }
 }

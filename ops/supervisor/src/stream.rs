@@ -13,6 +13,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::{MissedTickBehavior, interval};
 
 use crate::page::Page;
+use crate::session::Reader;
 use crate::view::{View, Viewer};
 
 /// The thread that makes events and reads the status of programs, so that browsers delay
@@ -58,22 +59,22 @@ pub(crate) struct Events(mpsc::Receiver<Bytes>);
 
 impl Events {
     /// Starts the stream of a view.
-    pub(crate) fn start(worker: &Worker, page: Arc<Page>, view: View, token: String) -> Self {
+    pub(crate) fn start(worker: &Worker, page: Arc<Page>, view: View, reader: Reader) -> Self {
         let (events, taken) = mpsc::channel(1);
-        worker.spawn(make(page, view, token, events));
+        worker.spawn(make(page, view, reader, events));
         Self(taken)
     }
 }
 
 /// Makes events until the browser has left, or its session has ended.
-async fn make(page: Arc<Page>, view: View, token: String, events: mpsc::Sender<Bytes>) {
+async fn make(page: Arc<Page>, view: View, reader: Reader, events: mpsc::Sender<Bytes>) {
     let mut ticks = interval(view.period());
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut viewer = Viewer::new(view);
     page.came();
     let retry = Bytes::from_static(b"retry: 2000\n\n");
     let mut is_there = events.send(retry).await.is_ok();
-    while is_there && page.may_read(&token) {
+    while is_there && page.may_read(&reader) {
         ticks.tick().await;
         is_there = match events.reserve().await {
             Ok(free) => {

@@ -66,6 +66,7 @@ mod verbs;
 mod wear;
 
 use std::ffi::OsString;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::{Arc, OnceLock};
@@ -80,7 +81,7 @@ use mappings::{FindSkills, Mapping, SpaceId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::pki::{self, Pki};
-use supervisor::{Page, ProxyUrl, StatusUrl};
+use supervisor::{Page, Pair, ProxyUrl, StatusUrl};
 
 use crate::port::{ServerPort, Setup};
 use crate::sks::{ServerKeys, Sks};
@@ -124,6 +125,10 @@ struct UaServer {
     /// https://cell.example.org: each user signs in
     #[arg(long, value_name = "URL")]
     page_proxy: Option<ProxyUrl>,
+    /// Serve the page to browsers of other hosts at this address too, as 0.0.0.0:9443, by TLS with
+    /// the certificate of the server: each user signs in
+    #[arg(long, value_name = "IP:PORT")]
+    page_tls: Option<SocketAddr>,
     /// Made when it is first wanted.
     #[arg(skip)]
     sks: OnceLock<Arc<Sks>>,
@@ -182,6 +187,25 @@ impl UaServer {
     fn page(&self) -> Arc<Page> {
         let made = || Page::new(Self::NAME, self.status.clone(), self.page_proxy.clone());
         Arc::clone(self.page.get_or_init(made))
+    }
+
+    /// Serves the page by TLS, if that is wanted. The certificate exists by then.
+    async fn serve_page_by_tls(&self) -> Result<(), Failure> {
+        let Some(address) = self.page_tls else {
+            return Ok(());
+        };
+        if self.arguments.flags.metrics.is_none() {
+            return Err(Failure::new(
+                FailureKind::Usage,
+                "--page-tls needs --metrics, as 127.0.0.1:9100: the page shows the state of programs",
+            ));
+        }
+        let root = self.pki_root();
+        let pair = Pair {
+            certificate: root.join(pki::OWN_CERTIFICATE),
+            key: root.join(pki::OWN_KEY),
+        };
+        self.page().serve_tls(address, pair).await
     }
 
     /// Returns the settings for announcing the server, or `None` if it is not announced.
@@ -309,6 +333,7 @@ impl Program for UaServer {
         };
         let port = ServerPort::start(&context.mapping, setup)?;
         self.page().operate(Arc::new(port.operations()));
+        self.serve_page_by_tls().await?;
         Ok(port)
     }
 }

@@ -59,7 +59,10 @@ pub use keys::{Fetched, Fetching, KeyRequest, KeyService};
 pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
 pub use mapping_file::{ConfigurationFile, NodeSetReader};
 pub use mappings::harmless_json;
-pub use metrics::{BoxFuture, PageBody, Requests, Site, Statuses, Told, Visit, full, serve_pages};
+pub use metrics::{
+    BoxFuture, PageBody, Requests, Secure, Site, Statuses, Stream, Told, Visit, full, serve_pages,
+    serve_secure,
+};
 pub use observer::Observer;
 pub use port::{Delivery, Execution, LinkState, Port, PortEvent};
 pub use present::Present;

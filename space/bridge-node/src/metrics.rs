@@ -5,6 +5,7 @@ mod parts;
 use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::fmt;
+use std::io;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,6 +19,7 @@ use hyper::body::Incoming;
 use hyper::service::service_fn;
 use hyper::{Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
@@ -72,12 +74,33 @@ pub trait Site: Send + Sync + 'static {
     fn describe(&self, at: SocketAddr) -> String;
 }
 
+/// A stream of a connection, such as a TLS stream.
+pub trait Stream: AsyncRead + AsyncWrite + Send + Unpin {}
+
+impl<S: AsyncRead + AsyncWrite + Send + Unpin> Stream for S {}
+
+/// Secures a connection, such as by a TLS handshake.
+pub type Secure = Arc<dyn Fn(TcpStream) -> BoxFuture<io::Result<Box<dyn Stream>>> + Send + Sync>;
+
 /// The connection of a request.
 #[derive(Debug, Clone)]
 pub struct Visit {
     /// The address of the client.
     pub peer: SocketAddr,
+    /// Whether the connection is secured.
+    pub is_secure: bool,
     is_long: Arc<AtomicBool>,
+}
+
+impl From<SocketAddr> for Visit {
+    /// Returns a connection from an address without security.
+    fn from(peer: SocketAddr) -> Self {
+        Self {
+            peer,
+            is_secure: false,
+            is_long: Arc::default(),
+        }
+    }
 }
 
 impl Visit {
@@ -195,7 +218,7 @@ impl<T: Told> Pages<T> {
             taps: self.taps.clone(),
             is_cell: self.is_cell,
         };
-        drop(tokio::spawn(accept(listener, served)));
+        drop(tokio::spawn(serve_all(listener, served)));
         Ok(())
     }
 
@@ -216,6 +239,43 @@ impl<T: Told> Pages<T> {
         *self.site.write().unwrap_or_else(PoisonError::into_inner) = Some(site);
     }
 }
+
+/// Serves all pages until the run loops end; in a cell, until the program ends.
+async fn serve_all<T: Told>(listener: TcpListener, served: Served<T>) {
+    let (parts, is_cell) = (served.parts.clone(), served.is_cell);
+    let respond = move |request, visit| -> BoxFuture<_> {
+        let served = served.clone();
+        Box::pin(page(request, served, visit))
+    };
+    tokio::select! {
+        () = accept(listener, None, Arc::new(respond)) => {}
+        () = parts.all_closed(), if !is_cell => {}
+    }
+}
+
+/// Serves the pages of `site` alone at a further address, over connections that `secure` secures,
+/// until the program ends.
+///
+/// # Errors
+/// The address cannot be bound.
+pub async fn serve_secure(
+    address: SocketAddr,
+    site: Arc<dyn Site>,
+    secure: Secure,
+) -> io::Result<SocketAddr> {
+    let listener = TcpListener::bind(address).await?;
+    let at = listener.local_addr().unwrap_or(address);
+    let respond = move |request, visit| Arc::clone(&site).answer(request, visit);
+    drop(tokio::spawn(accept(
+        listener,
+        Some(secure),
+        Arc::new(respond),
+    )));
+    Ok(at)
+}
+
+/// Answers the requests of a listener.
+type Respond = dyn Fn(Request<Incoming>, Visit) -> BoxFuture<Response<PageBody>> + Send + Sync;
 
 /// The sources of the pages.
 struct Served<T> {
@@ -243,30 +303,37 @@ impl<T> Clone for Served<T> {
     }
 }
 
-async fn accept<T: Told>(listener: TcpListener, served: Served<T>) {
+/// Accepts connections until the runtime ends.
+async fn accept(listener: TcpListener, secure: Option<Secure>, respond: Arc<Respond>) {
     let mut crowd = Crowd::default();
     loop {
-        let (stream, peer) = tokio::select! {
-            accepted = listener.accept() => match accepted {
-                Ok(accepted) => accepted,
-                // The process is probably out of descriptors; others may be closed after the pause.
-                Err(error) => {
-                    debug!(%error, "cannot accept a connection for metrics");
-                    tokio::time::sleep(ACCEPT_AGAIN).await;
-                    continue;
-                }
-            },
-            () = served.parts.all_closed(), if !served.is_cell => return,
+        let (stream, peer) = match listener.accept().await {
+            Ok(accepted) => accepted,
+            // The process is probably out of descriptors; others may be closed after the pause.
+            Err(error) => {
+                debug!(%error, "cannot accept a connection for metrics");
+                tokio::time::sleep(ACCEPT_AGAIN).await;
+                continue;
+            }
         };
-        let served = served.clone();
+        let (secure, respond) = (secure.clone(), Arc::clone(&respond));
         let visit = Visit {
-            peer,
-            is_long: Arc::default(),
+            is_secure: secure.is_some(),
+            ..Visit::from(peer)
         };
         let is_long = Arc::clone(&visit.is_long);
         let task = tokio::spawn(async move {
             let is_long = Arc::clone(&visit.is_long);
-            let mut answered = Box::pin(answer(stream, served, visit));
+            let answered = async move {
+                match secure {
+                    None => answer(stream, respond, visit).await,
+                    Some(secure) => match secure(stream).await {
+                        Ok(stream) => answer(stream, respond, visit).await,
+                        Err(error) => debug!(%error, "cannot secure a connection"),
+                    },
+                }
+            };
+            let mut answered = Box::pin(answered);
             let in_time = tokio::time::timeout(CONNECTION_TIME, &mut answered).await;
             match in_time {
                 Ok(()) => {}
@@ -333,10 +400,10 @@ impl Crowd {
     }
 }
 
-async fn answer<T: Told>(stream: TcpStream, served: Served<T>, visit: Visit) {
+async fn answer(stream: impl Stream + 'static, respond: Arc<Respond>, visit: Visit) {
     let service = service_fn(|request| {
-        let (served, visit) = (served.clone(), visit.clone());
-        async move { Ok::<_, Infallible>(page(request, served, visit).await) }
+        let responded = respond(request, visit.clone());
+        async move { Ok::<_, Infallible>(responded.await) }
     });
     let served = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())

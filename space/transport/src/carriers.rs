@@ -430,7 +430,11 @@ mod tests {
             let (bytes, from) = self.0.lock().unwrap().incoming.pop_front()?;
             buffer[..bytes.len()].copy_from_slice(&bytes);
             let length = bytes.len();
-            Some(Ok(Received { length, from }))
+            Some(Ok(Received {
+                length,
+                from,
+                stamp: None,
+            }))
         }
 
         fn follow(&mut self) -> Option<CarrierChange> {

@@ -408,7 +408,11 @@ impl HubQueue {
             bytes.clear();
             self.spare.push(bytes);
         }
-        Some(Received { length, from })
+        Some(Received {
+            length,
+            from,
+            stamp: None,
+        })
     }
 }
 

@@ -59,7 +59,11 @@ impl Carrier for Memory {
         let (bytes, from) = self.received.lock().unwrap().pop_front()?;
         let length = bytes.len();
         buffer[..length].copy_from_slice(&bytes);
-        Some(Ok(Received { length, from }))
+        Some(Ok(Received {
+                length,
+                from,
+                stamp: None,
+            }))
     }
 
     fn follow(&mut self) -> Option<CarrierChange> {
@@ -120,7 +124,7 @@ fn received(carrier: &mut dyn Carrier) -> Vec<(Vec<u8>, u16)> {
     let mut buffer = vec![0; 64];
     let mut all = Vec::new();
     while let Some(received) = carrier.try_recv(&mut buffer) {
-        let Received { length, from } = received.unwrap();
+        let Received { length, from, .. } = received.unwrap();
         all.push((buffer[..length].to_vec(), from.port()));
     }
     all
@@ -226,7 +230,7 @@ fn a_waiting_receiver_is_woken_by_another_thread() {
         scope.spawn(|| one.try_send(&Outgoing::new(b"a")).unwrap());
     });
     assert_eq!(wakes.0.load(Ordering::Relaxed), 1);
-    let Poll::Ready(Ok(Received { length, from })) = two.poll_recv(&mut cx, &mut buffer) else {
+    let Poll::Ready(Ok(Received { length, from, .. })) = two.poll_recv(&mut cx, &mut buffer) else {
         panic!("no message");
     };
     assert_eq!((&buffer[..length], from.port()), (&b"a"[..], 1));
