@@ -87,7 +87,8 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     Ok(Ended::WELL)
 }
 
-const USAGE: &str = "--deb, --rpm, --tar, --container and --program FILE";
+const USAGE: &str =
+    "--deb, --rpm, --tar, --container, --machine amd64 or arm64, and --program FILE";
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
@@ -120,6 +121,7 @@ impl Wanted {
                 "--rpm" => wanted.formats.push(Format::Rpm),
                 "--tar" => wanted.formats.push(Format::Tar),
                 "--container" => wanted.formats.push(Format::Container),
+                "--machine" => wanted.machine = Machine::named(rest.next()?)?,
                 "--program" => wanted.program = Some(PathBuf::from(rest.next()?)),
                 _ => return None,
             }
@@ -206,7 +208,7 @@ fn packaged(
     let crates = notices::crates(workspace, machine)?;
     let list = listed.with_extension("crates");
     fs::write(&list, notices::audit(&crates)?).with_context(|| list.display().to_string())?;
-    let mut objcopy = Command::new("objcopy");
+    let mut objcopy = Command::new(machine.tool("objcopy"));
     objcopy
         .arg("--strip-all")
         .arg(format!("--add-section=.dep-v0={}", list.display()))
@@ -311,14 +313,13 @@ fn files(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Adds manual pages and completions.
-fn pages(
-    workspace: &Workspace,
-    (machine, commit): (Machine, &Commit),
-    program: &Path,
-    tree: &mut Tree,
-) -> anyhow::Result<()> {
-    // The links of the program, beside it in a folder of their own.
+/// Returns a folder with programs whose help texts are those of the packaged program: links of it,
+/// or the programs of this machine if it does not run here.
+fn runnable(workspace: &Workspace, machine: Machine, program: &Path) -> anyhow::Result<PathBuf> {
+    if !machine.is_host() {
+        build(workspace)?;
+        return Ok(workspace.target.join("debug"));
+    }
     let folder = workspace.target.join(format!("names-{}", machine.debian));
     fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
     let target = folder.join(links::TARGET);
@@ -330,6 +331,17 @@ fn pages(
         "{} does not act as the bridges: give an `ua-bridge`",
         program.display()
     );
+    Ok(folder)
+}
+
+/// Adds manual pages and completions.
+fn pages(
+    workspace: &Workspace,
+    (machine, commit): (Machine, &Commit),
+    program: &Path,
+    tree: &mut Tree,
+) -> anyhow::Result<()> {
+    let folder = runnable(workspace, machine, program)?;
     let all = Help::all(&folder)?;
     let version = env!("CARGO_PKG_VERSION");
     for help in &all {
@@ -367,7 +379,10 @@ fn pages(
             scripts.fish,
         );
     }
-    fs::remove_dir_all(&folder).with_context(|| folder.display().to_string())
+    match machine.is_host() {
+        true => fs::remove_dir_all(&folder).with_context(|| folder.display().to_string()),
+        false => Ok(()),
+    }
 }
 
 /// Adds licences, the bill of materials, patches and changes.

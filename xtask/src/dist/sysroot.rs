@@ -31,7 +31,7 @@ pub(crate) struct Machine {
     pub(crate) rpm: &'static str,
 }
 
-/// All machines that packages can be made for, each on a machine of its kind.
+/// All machines that packages can be made for.
 const MACHINES: [Machine; 2] = [
     Machine {
         triple: "x86_64-unknown-linux-gnu",
@@ -52,6 +52,26 @@ impl Machine {
         MACHINES.into_iter().find(|machine| machine.rpm == here)
     }
 
+    /// Returns the machine with this architecture of Debian.
+    pub(crate) fn named(debian: &str) -> Option<Self> {
+        MACHINES
+            .into_iter()
+            .find(|machine| machine.debian == debian)
+    }
+
+    /// Returns whether this machine runs the programs.
+    pub(crate) fn is_host(self) -> bool {
+        Self::host() == Some(self)
+    }
+
+    /// Returns the name of a tool of the compiler for this machine, as `gcc`.
+    pub(crate) fn tool(self, name: &str) -> String {
+        match self.is_host() {
+            true => name.to_owned(),
+            false => format!("{}-linux-gnu-{name}", self.rpm),
+        }
+    }
+
     /// Adds the settings to `build` that compile and link for this machine and the old C library.
     ///
     /// # Errors
@@ -61,9 +81,22 @@ impl Machine {
         workspace: &Workspace,
         build: &mut Command,
     ) -> anyhow::Result<()> {
+        let gcc = self.tool("gcc");
         ensure!(
-            succeeds("gcc", &["--version"]),
-            "gcc is missing: install it (on Debian `apt-get install gcc libc6-dev`)"
+            succeeds(&gcc, &["--version"]),
+            "{gcc} is missing: install it (on Debian `apt-get install {}`)",
+            match self.is_host() {
+                true => "gcc libc6-dev".to_owned(),
+                false => format!("gcc-{}-linux-gnu", self.rpm),
+            }
+        );
+        let standard = printed(&["target-libdir", "--target", self.triple])?;
+        ensure!(
+            standard.is_dir(),
+            "Rust's standard library for {0} is missing: `rustup target add {0}`, or with Debian's rustc-web \
+             `dpkg --add-architecture {1} && apt-get update && apt-get install libstd-rust-web-dev:{1}`",
+            self.triple,
+            self.debian
         );
         let sysroot = self.sysroot(workspace)?;
         let sysroot = sysroot.display();
@@ -75,11 +108,12 @@ impl Machine {
             let folder = format!("{sysroot}/{folder}/{}-linux-gnu/", self.rpm);
             flags.push(format!("-Clink-arg=-B{folder}"));
         }
+        flags.extend(fold()?);
         build
             .args(["--target", self.triple])
-            .env(format!("{prefix}_LINKER"), "gcc")
+            .env(format!("{prefix}_LINKER"), &gcc)
             .env(format!("{prefix}_RUSTFLAGS"), flags.join(" "))
-            .env(format!("CC_{variable}"), "gcc")
+            .env(format!("CC_{variable}"), &gcc)
             .env(format!("CFLAGS_{variable}"), format!("--sysroot={sysroot}"));
         Ok(())
     }
@@ -122,6 +156,48 @@ impl Machine {
     }
 }
 
+/// Returns the flags for a linker that keeps one copy of functions with the same instructions, such
+/// as conversions, drops and formatting of similar types.
+///
+/// Folded functions have the same address. Rust does not promise different addresses of functions.
+/// Of the C code in the programs, OpenSSL compares addresses of functions to recognise its own
+/// defaults, such as the allocator, whose instructions no other function has. A backtrace shows one
+/// name for all functions that were folded into one.
+fn fold() -> anyhow::Result<Vec<String>> {
+    let mut flags = Vec::new();
+    // The linker that comes with rustc, else that of the system.
+    let host = printed(&["host-tuple"])?;
+    let own = printed(&["sysroot"])?
+        .join("lib/rustlib")
+        .join(host)
+        .join("bin/gcc-ld");
+    if own.join("ld.lld").exists() {
+        flags.push(format!("-Clink-arg=-B{}", own.display()));
+    } else {
+        ensure!(
+            succeeds("ld.lld", &["--version"]),
+            "ld.lld is missing: install it (on Debian `apt-get install lld`)"
+        );
+    }
+    flags.extend(["-Clink-arg=-fuse-ld=lld", "-Clink-arg=-Wl,--icf=all"].map(str::to_owned));
+    Ok(flags)
+}
+
+/// Returns what rustc prints for `--print` and these words, as a path.
+fn printed(words: &[&str]) -> anyhow::Result<PathBuf> {
+    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let output = Command::new(rustc).arg("--print").args(words).output();
+    let output = output.context("rustc does not start")?;
+    ensure!(
+        output.status.success(),
+        "rustc --print {}: {}",
+        words.join(" "),
+        String::from_utf8_lossy(&output.stderr)
+    );
+    let text = String::from_utf8(output.stdout)?;
+    Ok(PathBuf::from(text.trim()))
+}
+
 /// Makes all absolute links below a folder relative, because they would lead to the libraries of
 /// this host. `depth` is the number of folders above `folder` in the root.
 fn relate_links(folder: &Path, depth: usize) -> anyhow::Result<()> {
@@ -158,6 +234,25 @@ fn packages(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn equal_functions_are_folded_by_the_linker() {
+        let folder = std::env::temp_dir().join(format!("xtask-fold-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let source = folder.join("main.rs");
+        let code = "#[inline(never)] fn a(x: usize) -> usize { x * 3 + 1 }\n\
+                    #[inline(never)] fn b(x: usize) -> usize { x * 3 + 1 }\n\
+                    fn main() { let n = std::env::args().count(); \
+                    assert_eq!((a as *const (), a(n)), (b as *const (), b(n))); }";
+        fs::write(&source, code).unwrap();
+        let program = folder.join("main");
+        let mut rustc = Command::new("rustc");
+        rustc.args(["-O", "-Clinker=gcc"]).args(fold().unwrap());
+        let built = rustc.arg(&source).arg("-o").arg(&program).status().unwrap();
+        assert!(built.success());
+        assert!(Command::new(&program).status().unwrap().success());
+        fs::remove_dir_all(&folder).unwrap();
+    }
 
     #[test]
     fn absolute_links_lead_to_files_of_the_folder() {
