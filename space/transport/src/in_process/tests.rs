@@ -60,10 +60,10 @@ impl Carrier for Memory {
         let length = bytes.len();
         buffer[..length].copy_from_slice(&bytes);
         Some(Ok(Received {
-                length,
-                from,
-                stamp: None,
-            }))
+            length,
+            from,
+            stamp: None,
+        }))
     }
 
     fn follow(&mut self) -> Option<CarrierChange> {
