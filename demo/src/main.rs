@@ -1,5 +1,5 @@
 //! Scenarios with simulated robots and the released programs: the fault-tolerant product assembly
-//! line with skills, the same line with topics, plug and produce, and the tool change.
+//! line with skills, the same line with topics, plug and produce, the tool change, and a batch.
 //!
 //! All processes of the demo use the same binary. Without a subcommand it starts the others, which
 //! are hidden subcommands, and the other programs in its directory. The robots and the components
@@ -11,9 +11,10 @@
 //! - `line`: their shared values
 //! - `supervisor` and `orchestra`: the OPC UA client, and the process that starts and watches all
 //!   others
-//! - `skilled`, `plug` and `tools`: the other scenarios
+//! - `skilled`, `plug`, `tools` and `batch`: the other scenarios
 //! - `stage`: the shared parts of the scenarios
 
+mod batch;
 mod clock;
 mod event;
 mod line;
@@ -86,6 +87,8 @@ enum Scenario {
     PlugAndProduce,
     /// A robot that changes its tools, with devices behind their protocols; one is lost and plugged in again
     ToolChange,
+    /// Three simulated process modules that a recipe of BatchML runs: dose, stir and react
+    Batch,
 }
 
 /// The demo's own processes.
@@ -198,6 +201,10 @@ fn main() -> ExitCode {
                         json,
                     };
                     runtime.block_on(Box::pin(skilled::play(plan)))
+                }
+                Scenario::Batch => {
+                    let plan = batch::Plan { speed, json };
+                    runtime.block_on(Box::pin(batch::play(plan)))
                 }
                 Scenario::ToolChange => {
                     let plan = tools::Plan {

@@ -35,7 +35,7 @@ pub(crate) use self::fact::MachineEvent;
 use self::line::{Line, Teller};
 use self::report::{Report, Run};
 use self::world::World;
-use crate::clock::wall_nanos;
+use crate::clock::{millis, wall_nanos};
 use crate::event::{Event, MasterEvent};
 use crate::line::DOMAIN;
 use crate::pace::Speed;
@@ -650,12 +650,6 @@ async fn learn(conveyor: &dyn Runs, mut killed: watch::Receiver<Option<i64>>, sh
 
 fn elapsed(since: Instant) -> f64 {
     since.elapsed().as_secs_f64() * 1e3
-}
-
-fn millis(nanos: i64) -> f64 {
-    #[expect(clippy::cast_precision_loss, reason = "a time for people to see")]
-    let millis = nanos as f64 / 1e6;
-    millis
 }
 
 const LINE: Who = Who("line", "35");

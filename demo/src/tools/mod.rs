@@ -28,7 +28,7 @@ use tokio::time::{Instant, sleep, timeout};
 
 use self::cell::{CHANGER, DEVICE_PORTS, FINGERS, HANDLING, PARTS, Part, VACUUM};
 use self::report::{Report, Run};
-use crate::clock::wall_nanos;
+use crate::clock::{millis, wall_nanos};
 use crate::pace::Speed;
 use crate::stage::{
     Failure, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who, address,
@@ -547,12 +547,6 @@ fn must(run: &Run) -> Result<(), Stop> {
 
 fn elapsed(since: Instant) -> f64 {
     since.elapsed().as_secs_f64() * 1e3
-}
-
-fn millis(nanos: i64) -> f64 {
-    #[expect(clippy::cast_precision_loss, reason = "a time for people to see")]
-    let millis = nanos as f64 / 1e6;
-    millis
 }
 
 const LDS_PORT: u16 = 4840;
