@@ -280,6 +280,7 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
         "actions",
         "goals",
         "objects",
+        "process-conditions",
         "process-parameters",
         "process-steps",
         "processes",

@@ -3,6 +3,7 @@
 //! run fails.
 
 mod compensate;
+mod sequence;
 mod watched;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -11,7 +12,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::frame::Frame;
-use skills::{PartEnd, PickAndPlace, Runs, SkillFault, Teller, Value, run_part};
+use skills::{PickAndPlace, Runs, Teller, Value};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
@@ -19,7 +20,7 @@ use crate::plan::{Facts, Fallen, Offer, Plan, Situation, plan};
 use crate::process::{Given, Job, Process, Role, Step};
 use crate::record::{How, Planned, Run};
 
-use compensate::Done;
+use sequence::{Progress, StepEnd};
 use watched::Watched;
 
 /// The plant as the execution of a process needs it.
@@ -238,24 +239,24 @@ struct Chosen {
 impl Execution<'_> {
     /// Runs the process. If it fails, its completed steps are compensated.
     async fn run(&self) -> Result<(), String> {
-        let mut done = Vec::new();
-        let ended = self.forward(&mut done).await;
+        let mut progress = Progress::default();
+        let ended = self.forward(&mut progress).await;
         match ended {
             Ok(()) => Ok(()),
-            Err(why) => Err(self.compensated(why, &done).await),
+            Err(why) => Err(self.compensated(why, &progress.done).await),
         }
     }
 
     /// Runs plans until all steps are done.
-    async fn forward(&self, done: &mut Vec<Done>) -> Result<(), String> {
+    async fn forward(&self, progress: &mut Progress) -> Result<(), String> {
         let mut last = String::new();
         for number in 1..=MOST_PLANS {
-            let (plan, chosen) = self.planned(&last, done).await?;
+            let (plan, chosen) = self.planned(&last, progress).await?;
             self.log.change(|kept, now| {
                 kept.run.waits_for = None;
                 kept.run.plans.push(Planned::begins(number, now, plan));
             });
-            let ended = self.carry_out(&chosen, done).await;
+            let ended = self.carry_out(&chosen, progress).await;
             let (outcome, reason) = match &ended {
                 Ended::Done => (How::Done, None),
                 Ended::Broken(why) | Ended::Over(why) => (How::Failed, Some(why.clone())),
@@ -281,9 +282,10 @@ impl Execution<'_> {
 
     /// Waits for a complete plan of the steps that are not done, and returns it with the chosen
     /// offers. The run has the use of their components then.
-    async fn planned(&self, last: &str, done: &[Done]) -> Result<(Plan, Chosen), String> {
+    async fn planned(&self, last: &str, progress: &Progress) -> Result<(Plan, Chosen), String> {
         let run = self.log.run().run;
-        let kept = compensate::kept(self.process, done);
+        let kept = compensate::kept(self.process, &progress.done);
+        let passed: Vec<usize> = progress.passed.keys().copied().collect();
         let after = if last.is_empty() {
             String::new()
         } else {
@@ -299,11 +301,12 @@ impl Execution<'_> {
             let situation = Situation {
                 fallen: &fallen,
                 kept: &kept,
+                passed: &passed,
                 used: Some(&used),
             };
             let plan = plan(self.process, &offers, situation, &OfPlant(self.plant));
             if plan.is_complete() {
-                let chosen = self.chosen(&plan, &offers, done.len());
+                let chosen = self.chosen(&plan, &offers, progress);
                 let all = chosen.open.iter().map(|(_, offer)| offer);
                 let all = all.chain(chosen.undo.values());
                 let all = all.chain(kept.iter().map(|kept| &kept.offer));
@@ -333,20 +336,22 @@ impl Execution<'_> {
         }
     }
 
-    /// Returns the chosen offers of a plan, without those of the first steps, which are done.
-    fn chosen(&self, plan: &Plan, offers: &[Offer], done: usize) -> Chosen {
+    /// Returns the chosen offers of a plan, without those of the steps that are over.
+    fn chosen(&self, plan: &Plan, offers: &[Offer], progress: &Progress) -> Chosen {
         let of = |role: Role| {
             let skill = plan.chosen(role)?;
             offers.iter().find(|offer| offer.skill == skill).cloned()
         };
         let mut open: Vec<(Role, Offer)> = Vec::new();
-        let left = self.process.steps.iter().skip(done);
-        for role in left.flat_map(|step| &step.needs).map(|need| need.role) {
+        let left = self.process.steps.iter().enumerate();
+        let left = left.filter(|(number, _)| !progress.is_over(*number));
+        for role in left.flat_map(|(_, step)| &step.needs).map(|need| need.role) {
             if open.iter().all(|(known, _)| *known != role) {
                 open.extend(of(role).map(|offer| (role, offer)));
             }
         }
-        let undo = (done..self.process.steps.len()).filter_map(|number| {
+        let left = (0..self.process.steps.len()).filter(|number| !progress.is_over(*number));
+        let undo = left.filter_map(|number| {
             let role = Role::Alone(self.process.compensation_of(number));
             Some((number, of(role)?))
         });
@@ -374,7 +379,7 @@ impl Execution<'_> {
         Ok((opened, watched))
     }
 
-    async fn carry_out(&self, chosen: &Chosen, done: &mut Vec<Done>) -> Ended {
+    async fn carry_out(&self, chosen: &Chosen, progress: &mut Progress) -> Ended {
         let offers: Vec<Offer> = chosen.open.iter().map(|(_, offer)| offer.clone()).collect();
         let (opened, skills) = match self.open(&offers).await {
             Ok(opened) => opened,
@@ -402,7 +407,7 @@ impl Execution<'_> {
                 let roles: Vec<_> = roles.zip(skills).collect();
                 self.pick_and_place(job, &roles).await
             }
-            Job::Sequence => self.sequence(chosen, &skills, done).await,
+            Job::Sequence => self.sequence(chosen, &skills, progress).await,
         };
         close(opened).await;
         ended
@@ -451,104 +456,6 @@ impl Execution<'_> {
             }
         }
     }
-
-    async fn sequence(
-        &self,
-        chosen: &Chosen,
-        skills: &[Arc<dyn Runs>],
-        done: &mut Vec<Done>,
-    ) -> Ended {
-        for ((role, offer), skill) in chosen.open.iter().zip(skills) {
-            let number = done.len();
-            let Some(step) = self
-                .process
-                .steps
-                .get(number)
-                .filter(|_| *role == Role::Alone(number))
-            else {
-                return Ended::Over("the plan has another step than the process".to_owned());
-            };
-            self.teller.step("Step").await;
-            let before = self.log.ran();
-            match self.one(step, (offer, &**skill), done).await {
-                StepEnd::Done(results) => done.push(Done {
-                    number,
-                    offer: offer.clone(),
-                    undo: chosen.undo.get(&number).cloned(),
-                    results,
-                }),
-                StepEnd::Stopped(why) | StepEnd::Unresolved(why) => return Ended::Over(why),
-                // The run of a lost component may go on; another component must not repeat it.
-                StepEnd::Lost(why) if self.log.ran() > before => return Ended::Over(why),
-                StepEnd::Lost(why) | StepEnd::Failed(why) => return Ended::Broken(why),
-            }
-        }
-        Ended::Done
-    }
-
-    /// Runs the skill of a step or of a compensation to its end.
-    async fn one(
-        &self,
-        step: &Step,
-        (offer, skill): (&Offer, &dyn Runs),
-        done: &[Done],
-    ) -> StepEnd {
-        self.log.step(&step.name);
-        let given = match compensate::resolved(self.plant, step, done) {
-            Ok(given) => given,
-            Err(why) => return StepEnd::Unresolved(format!("{}: {why}", step.name)),
-        };
-        let values = match self.plant.values(&offer.skill, &given) {
-            Ok(values) => values,
-            Err(why) => {
-                self.log.fell(Fallen {
-                    component: offer.component.clone(),
-                    since_ms: offer.since_ms,
-                    skill: Some(offer.skill.clone()),
-                    why: format!("it does not take the parameters: {why}"),
-                });
-                return StepEnd::Failed(format!("{}: {why}", step.name));
-            }
-        };
-        let within = self.process.within;
-        let part = run_part(skill, values, within, self, self.teller.stopped());
-        let outcome = match part.await {
-            PartEnd::Ended(outcome) => outcome,
-            PartEnd::Interrupted { halted: Ok(()), .. } => {
-                return StepEnd::Stopped("stopped".to_owned());
-            }
-            PartEnd::Interrupted {
-                halted: Err(fault), ..
-            } => {
-                let name = skill.name();
-                return StepEnd::Stopped(format!("stopped, but {name} may go on: {fault}"));
-            }
-        };
-        let is_lost = matches!(outcome, Err(SkillFault::Lost(_)));
-        let why = match outcome {
-            Ok(outcome) if outcome.succeeded => return StepEnd::Done(outcome.results),
-            Ok(outcome) => outcome.message,
-            Err(fault) => fault.to_string(),
-        };
-        let why = format!("{}: {} {why}", step.name, skill.name());
-        match is_lost {
-            true => StepEnd::Lost(why),
-            false => StepEnd::Failed(why),
-        }
-    }
-}
-
-/// The end of a step.
-enum StepEnd {
-    /// With its results.
-    Done(Vec<(String, Value)>),
-    /// The caller stopped the run.
-    Stopped(String),
-    /// An earlier step did not return a result.
-    Unresolved(String),
-    Failed(String),
-    /// Its component is lost.
-    Lost(String),
 }
 
 /// Releases the leases of components. A lost component does not respond to the close.
@@ -621,10 +528,12 @@ impl Log {
             .clone()
     }
 
-    /// Returns the number of skill runs in the current plan.
-    fn ran(&self) -> usize {
+    /// Returns the number of runs of a skill in the current plan.
+    fn ran(&self, skill: &str) -> usize {
         let kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        kept.run.plans.last().map_or(0, |plan| plan.ran.len())
+        kept.run.plans.last().map_or(0, |plan| {
+            plan.ran.iter().filter(|ran| ran.skill == skill).count()
+        })
     }
 
     fn step(&self, step: &str) {

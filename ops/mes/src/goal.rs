@@ -218,7 +218,7 @@ impl Goal {
                     .map(|action| action.parameters.clone())
                     .unwrap_or_default(),
                 by: By::Any,
-                compensation: None,
+                ..Step::default()
             }
         };
         Process {

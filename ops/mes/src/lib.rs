@@ -5,6 +5,7 @@
 //!
 //! - `settings`: the YAML
 //! - `process`, `read_process`: processes and their steps, and how the graph has them
+//! - `recipe`: processes of BatchML and BPMN
 //! - `plan`: the assignment of skills to steps, with reasons
 //! - `execute`: the execution of a plan, and planning again after a loss
 //! - `record`: the record of runs
@@ -26,6 +27,7 @@ mod locate_skill;
 mod plan;
 mod process;
 mod read_process;
+mod recipe;
 mod record;
 mod settings;
 mod sources;

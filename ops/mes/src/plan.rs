@@ -77,6 +77,9 @@ pub(crate) struct PlannedNeed {
     /// Whether the component of a completed step has to do it.
     #[serde(skip)]
     is_bound: bool,
+    /// Whether the step was passed, so that it needs no skill.
+    #[serde(skip)]
+    is_passed: bool,
 }
 
 impl PlannedNeed {
@@ -97,6 +100,7 @@ impl PlannedNeed {
             }],
             role_is: need.role,
             is_bound: true,
+            is_passed: false,
         }
     }
 }
@@ -153,8 +157,21 @@ pub(crate) struct Situation<'a> {
     pub(crate) fallen: &'a [Fallen],
     /// The steps that are done.
     pub(crate) kept: &'a [Kept],
+    /// The numbers of the steps that were passed without being done.
+    pub(crate) passed: &'a [usize],
     /// The components that other runs use, with these runs.
     pub(crate) used: Option<&'a BTreeMap<String, String>>,
+}
+
+impl Situation<'_> {
+    /// Returns whether a role belongs to a step that was passed, or to its compensation.
+    fn is_passed(&self, process: &Process, role: Role) -> bool {
+        self.passed.iter().any(|number| {
+            [*number, process.compensation_of(*number)]
+                .map(Role::Alone)
+                .contains(&role)
+        })
+    }
 }
 
 /// The facts about skills that a plan needs. Each check returns the reason why it fails.
@@ -177,7 +194,8 @@ pub(crate) fn plan(
     facts: &dyn Facts,
 ) -> Plan {
     let mut roles: BTreeMap<Role, Vec<&Need>> = BTreeMap::new();
-    for need in process.numbered().flat_map(|(_, step)| &step.needs) {
+    let needs = process.numbered().flat_map(|(_, step)| &step.needs);
+    for need in needs.filter(|need| !situation.is_passed(process, need.role)) {
         roles.entry(need.role).or_default().push(need);
     }
     let mut judging = Judging::new(process, situation, facts);
@@ -371,6 +389,7 @@ impl Plan {
         self.steps
             .iter()
             .flat_map(|step| step.needs.iter().map(|need| (step.step.as_str(), need)))
+            .filter(|(_, need)| !need.is_passed)
     }
 }
 

@@ -39,6 +39,133 @@ pub(crate) struct Step {
     pub(crate) by: By,
     /// The step that undoes this one after a later step has failed, in a sequence.
     pub(crate) compensation: Option<Box<Self>>,
+    /// The earlier steps that end before this one begins, in a sequence; the previous step if
+    /// `None`. Steps that do not wait for each other run in parallel.
+    pub(crate) after: Option<Vec<usize>>,
+    /// The step is skipped unless all conditions of one of these alternatives hold. Without
+    /// alternatives it is not skipped.
+    pub(crate) when: Vec<Vec<Condition>>,
+    /// Time limit of the skill, if it differs from that of the process.
+    pub(crate) within: Option<Duration>,
+}
+
+/// A condition about an earlier step.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Condition {
+    /// The number of the step, from 0.
+    pub(crate) step: usize,
+    pub(crate) test: Test,
+    /// Whether the condition holds if the test fails.
+    pub(crate) is_negated: bool,
+}
+
+/// A test of a step that has ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Test {
+    /// A result of the step compares with a value.
+    Result {
+        name: String,
+        compare: Compare,
+        value: serde_json::Value,
+    },
+    /// The step has ended in this way, and its machines stand still.
+    Ended(BadEnd),
+}
+
+/// A comparison.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Compare {
+    Equal,
+    NotEqual,
+    Less,
+    LessOrEqual,
+    Greater,
+    GreaterOrEqual,
+}
+
+/// An end of a step that other steps handle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum BadEnd {
+    Failed,
+    /// It was halted after its time limit.
+    TimedOut,
+}
+
+impl Compare {
+    /// All comparisons, with their signs. A sign that begins with another sign comes before it.
+    pub(crate) const ALL: [(Self, &'static str); 6] = [
+        (Self::Equal, "=="),
+        (Self::NotEqual, "!="),
+        (Self::LessOrEqual, "<="),
+        (Self::GreaterOrEqual, ">="),
+        (Self::Less, "<"),
+        (Self::Greater, ">"),
+    ];
+
+    pub(crate) fn sign(self) -> &'static str {
+        let mut all = Self::ALL.iter();
+        all.find(|(known, _)| *known == self)
+            .map_or("", |(_, sign)| sign)
+    }
+
+    /// Compares a result with a value.
+    ///
+    /// # Errors
+    /// The reason why they cannot be compared.
+    pub(crate) fn holds(
+        self,
+        result: &serde_json::Value,
+        value: &serde_json::Value,
+    ) -> Result<bool, String> {
+        use std::cmp::Ordering;
+        let order = match (result.as_f64(), value.as_f64()) {
+            (Some(one), Some(other)) => one.partial_cmp(&other),
+            _ if result == value => Some(Ordering::Equal),
+            _ if std::mem::discriminant(result) != std::mem::discriminant(value) => None,
+            _ if matches!(self, Self::Equal | Self::NotEqual) => Some(Ordering::Less),
+            _ => match (result.as_str(), value.as_str()) {
+                (Some(one), Some(other)) => Some(one.cmp(other)),
+                _ => None,
+            },
+        };
+        let order = order.ok_or_else(|| format!("{result} cannot be compared with {value}"))?;
+        Ok(match self {
+            Self::Equal => order.is_eq(),
+            Self::NotEqual => order.is_ne(),
+            Self::Less => order.is_lt(),
+            Self::LessOrEqual => order.is_le(),
+            Self::Greater => order.is_gt(),
+            Self::GreaterOrEqual => order.is_ge(),
+        })
+    }
+}
+
+impl BadEnd {
+    /// Returns the name in the graph.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Failed => "failed",
+            Self::TimedOut => "timed out",
+        }
+    }
+}
+
+impl Step {
+    /// Returns the numbers of the steps that end before this step begins. `number` is that of this
+    /// step: it waits for the steps of its order, its conditions and the results that it takes.
+    pub(crate) fn waits_for(&self, number: usize) -> Vec<usize> {
+        let mut all = match &self.after {
+            Some(after) => after.clone(),
+            None => number.checked_sub(1).into_iter().collect(),
+        };
+        all.extend(self.when.iter().flatten().map(|condition| condition.step));
+        let results = self
+            .parameters
+            .iter()
+            .filter_map(|given| given.result.as_ref());
+        all.extend(results.map(|of| of.step));
+        all
+    }
 }
 
 /// A parameter as the process gives it.
@@ -157,6 +284,13 @@ impl Process {
         self.steps.iter().enumerate().chain(compensations)
     }
 
+    /// Returns whether other steps handle an end of the step with this number.
+    pub(crate) fn handles(&self, number: usize, end: BadEnd) -> bool {
+        let conditions = self.steps.iter().flat_map(|step| &step.when).flatten();
+        let mut handlers = conditions.filter(|condition| !condition.is_negated);
+        handlers.any(|condition| condition.step == number && condition.test == Test::Ended(end))
+    }
+
     /// Returns the number of the role of the compensation of a step.
     pub(crate) fn compensation_of(&self, number: usize) -> usize {
         self.steps.len().saturating_add(number)
@@ -205,6 +339,19 @@ impl Process {
                 say(step_iri, v::COMPENSATED_BY, iri(&undo));
                 of_step(compensation, &undo, &iris, &mut say, type_iri);
             }
+            if let Some(within) = step.within {
+                say(step_iri, v::WITHIN, Object::Number(within.as_secs_f64()));
+            }
+            match step.after.as_deref() {
+                None => {}
+                Some([]) => say(step_iri, v::AFTER, iri(&self.iri)),
+                Some(after) => {
+                    for other in after.iter().filter_map(|number| iris.get(*number)) {
+                        say(step_iri, v::AFTER, iri(other));
+                    }
+                }
+            }
+            of_conditions(&step.when, step_iri, &iris, &mut say);
             of_step(step, step_iri, &iris, &mut say, type_iri);
         }
         all
@@ -223,6 +370,51 @@ impl Process {
             });
         }
         iris
+    }
+}
+
+/// States the alternatives of which one must hold.
+fn of_conditions(
+    when: &[Vec<Condition>],
+    step_iri: &str,
+    iris: &[String],
+    say: &mut dyn FnMut(&str, &str, Object),
+) {
+    let iri = |iri: &str| Object::Iri(iri.to_owned());
+    for (alternative, number) in when.iter().zip(1..) {
+        let alternative_iri = format!("{step_iri}/when/{number}");
+        say(step_iri, v::WHEN, iri(&alternative_iri));
+        for (condition, position) in alternative.iter().zip(1_i64..) {
+            let condition_iri = format!("{alternative_iri}/{position}");
+            say(&alternative_iri, v::CONDITION, iri(&condition_iri));
+            say(&condition_iri, v::POSITION, Object::Integer(position));
+            if let Some(other) = iris.get(condition.step) {
+                say(&condition_iri, v::RESULT_OF, iri(other));
+            }
+            if condition.is_negated {
+                say(&condition_iri, v::NEGATED, Object::Boolean(true));
+            }
+            match &condition.test {
+                Test::Result {
+                    name,
+                    compare,
+                    value,
+                } => {
+                    say(&condition_iri, v::RESULT, Object::Text(name.clone()));
+                    let sign = Object::Text(compare.sign().to_owned());
+                    say(&condition_iri, v::COMPARE, sign);
+                    let (predicate, value) = literal(value);
+                    say(&condition_iri, predicate, value);
+                }
+                Test::Ended(end) => {
+                    say(
+                        &condition_iri,
+                        v::ENDS_AS,
+                        Object::Text(end.name().to_owned()),
+                    );
+                }
+            }
+        }
     }
 }
 

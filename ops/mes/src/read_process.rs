@@ -1,6 +1,6 @@
 //! Reads processes from the graph, which decides which processes run.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use knowledge::{Answer, Knowledge};
@@ -8,7 +8,9 @@ use serde_json::Value;
 use skills::TypeName;
 
 use crate::locate_skill::numbers_of;
-use crate::process::{By, Given, Job, Need, Process, ResultOf, Role, Step};
+use crate::process::{
+    BadEnd, By, Compare, Condition, Given, Job, Need, Process, ResultOf, Role, Step, Test,
+};
 
 /// The processes of the graph: each can run, or has a reason why it cannot.
 #[derive(Debug, Default)]
@@ -28,6 +30,7 @@ impl Processes {
             answer.map_err(|fault| fault.to_string())
         };
         let (steps, parameters) = (ask("process-steps")?, ask("process-parameters")?);
+        let conditions = ask("process-conditions")?;
         let mut by_process: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
         for row in &steps.rows {
             let process = Answer::text(row, "process");
@@ -35,7 +38,11 @@ impl Processes {
         }
         let mut processes = Self::default();
         for (iri, rows) in by_process {
-            match process(iri, &rows, &parameters.rows) {
+            let facts = Facts {
+                parameters: &parameters.rows,
+                conditions: &conditions.rows,
+            };
+            match process(iri, &rows, facts) {
                 Ok(process) => processes.all.push(process),
                 Err(why) => drop(processes.faults.insert(iri.to_owned(), why)),
             }
@@ -44,7 +51,15 @@ impl Processes {
     }
 }
 
-fn process(iri: &str, rows: &[&Row], parameters: &[Row]) -> Result<Process, String> {
+/// The rows about the steps of all processes.
+#[derive(Debug, Clone, Copy)]
+struct Facts<'a> {
+    parameters: &'a [Row],
+    conditions: &'a [Row],
+}
+
+fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String> {
+    let parameters = facts.parameters;
     let within = seconds(one(rows, "within")?, "ua:within")?.unwrap_or(USUALLY_WITHIN);
     let wait = seconds(one(rows, "wait")?, "ua:wait")?.unwrap_or(USUALLY_WAIT);
     let name = one(rows, "name")?.and_then(Value::as_str);
@@ -89,6 +104,16 @@ fn process(iri: &str, rows: &[&Row], parameters: &[Row]) -> Result<Process, Stri
         let role = job.is_none().then_some(Role::Alone(number));
         let read = step(part, rows, role, (&order, number), parameters);
         let mut read = read.map_err(|why| format!("the step {part} {why}"))?;
+        let ordered = order_of(&mut read, rows, iri, (&order, number))
+            .and_then(|()| conditions_of(part, (&order, number), facts.conditions))
+            .map(|when| read.when = when);
+        ordered.map_err(|why| format!("the step {part} {why}"))?;
+        let is_plain = read.after.is_none() && read.when.is_empty() && read.within.is_none();
+        if job.is_some() && !is_plain {
+            return Err(format!(
+                "the step {part} has an order, a condition or a time limit, and a pick-and-place process has its own"
+            ));
+        }
         if let Some(rows) = undone.get(part) {
             let role = Role::Alone(order.len().saturating_add(number));
             let undone = compensation(&read.name, rows, role, (&order, number), parameters);
@@ -121,6 +146,106 @@ fn process(iri: &str, rows: &[&Row], parameters: &[Row]) -> Result<Process, Stri
         steps,
         within,
         wait,
+    })
+}
+
+/// Reads the order and the time limit of a step.
+fn order_of(
+    step: &mut Step,
+    rows: &[&Row],
+    process: &str,
+    (order, number): (&[&str], usize),
+) -> Result<(), String> {
+    step.within = seconds(one(rows, "limit")?, "ua:within")?;
+    let named = rows.iter().map(|row| Answer::text(row, "after"));
+    let named: BTreeSet<&str> = named.filter(|after| !after.is_empty()).collect();
+    if named.is_empty() {
+        return Ok(());
+    }
+    let mut after = Vec::new();
+    for other in named.into_iter().filter(|other| *other != process) {
+        after.push(earlier(other, (order, number))?);
+    }
+    after.sort_unstable();
+    step.after = Some(after);
+    Ok(())
+}
+
+/// Returns the number of a step that comes before the step with a number.
+fn earlier(other: &str, (order, number): (&[&str], usize)) -> Result<usize, String> {
+    let step = order.iter().position(|known| *known == other);
+    step.filter(|step| *step < number)
+        .ok_or_else(|| format!("names {other}, which is no earlier step"))
+}
+
+/// Reads the alternatives of a step, of which one must hold.
+fn conditions_of(
+    part: &str,
+    place: (&[&str], usize),
+    rows: &[Row],
+) -> Result<Vec<Vec<Condition>>, String> {
+    let mut alternatives: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
+    for row in rows.iter().filter(|row| Answer::text(row, "part") == part) {
+        let of = Answer::text(row, "alternative");
+        alternatives.entry(of).or_default().push(row);
+    }
+    let mut all = Vec::new();
+    for (iri, rows) in alternatives {
+        let mut conditions: Vec<(i64, Condition)> = Vec::new();
+        for row in rows {
+            if Answer::text(row, "condition").is_empty() {
+                return Err(format!("has the ua:when {iri} without a ua:condition"));
+            }
+            let position = row.get("position").and_then(Value::as_i64);
+            let read = condition(row, place);
+            conditions.push((
+                position.unwrap_or_default(),
+                read.map_err(|why| format!("has a condition that {why}"))?,
+            ));
+        }
+        conditions.sort_by_key(|(position, _)| *position);
+        all.push(conditions.into_iter().map(|(_, read)| read).collect());
+    }
+    Ok(all)
+}
+
+fn condition(row: &Row, place: (&[&str], usize)) -> Result<Condition, String> {
+    let is_there = |column: &str| row.get(column).filter(|value| !value.is_null());
+    let step = earlier(Answer::text(row, "of"), place)?;
+    let test = match (is_there("result"), is_there("ends_as")) {
+        (Some(name), None) => {
+            let sign = Answer::text(row, "compare");
+            let compare = Compare::ALL.iter().find(|(_, known)| *known == sign);
+            let compare = compare.ok_or_else(|| {
+                format!("has the ua:compare `{sign}`; use ==, !=, <, <=, > or >=")
+            })?;
+            let value = match (is_there("value"), is_there("json")) {
+                (Some(value), None) => value.clone(),
+                (None, Some(json)) => serde_json::from_str(json.as_str().unwrap_or_default())
+                    .map_err(|error| format!("has a ua:valueJson that is no JSON: {error}"))?,
+                _ => return Err("has no value, or several".to_owned()),
+            };
+            Test::Result {
+                name: name.as_str().unwrap_or_default().to_owned(),
+                compare: compare.0,
+                value,
+            }
+        }
+        (None, Some(end)) => {
+            let all = [BadEnd::Failed, BadEnd::TimedOut];
+            let known = all
+                .into_iter()
+                .find(|known| Some(known.name()) == end.as_str());
+            Test::Ended(known.ok_or_else(|| {
+                format!("has the ua:endsAs {end}; use \"failed\" or \"timed out\"")
+            })?)
+        }
+        _ => return Err("has neither a ua:result nor a ua:endsAs, or both".to_owned()),
+    };
+    Ok(Condition {
+        step,
+        test,
+        is_negated: is_there("negated").and_then(Value::as_bool) == Some(true),
     })
 }
 
@@ -209,7 +334,7 @@ fn step(
         needs,
         parameters: given,
         by,
-        compensation: None,
+        ..Step::default()
     })
 }
 

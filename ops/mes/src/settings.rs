@@ -1,5 +1,6 @@
 //! The YAML of the MES.
 
+mod composite;
 mod files;
 
 use std::net::SocketAddr;
@@ -11,9 +12,9 @@ use skills::yaml::{Code, Findings, Kind, Node, Reader, parse};
 use skills::{Lds, Security, TypeName};
 
 use crate::process::{By, Given, Job, Need, Process, ResultOf, Role, Step};
-use crate::read_process::{MOST_STEPS, USUALLY_APPROACH, USUALLY_WAIT, USUALLY_WITHIN};
+use crate::read_process::{MOST_STEPS, USUALLY_WAIT, USUALLY_WITHIN};
 
-pub(crate) use files::{Connect, Manifest, RmlSource, Source};
+pub(crate) use files::{Connect, Manifest, RecipeSource, RmlSource, Source};
 
 /// The settings of the MES.
 #[derive(Debug, Clone)]
@@ -38,6 +39,8 @@ pub(crate) struct Settings {
     pub(crate) nodesets: Vec<Source>,
     pub(crate) manifests: Vec<Manifest>,
     pub(crate) rml: Vec<RmlSource>,
+    /// Recipes of BatchML and BPMN.
+    pub(crate) recipes: Vec<RecipeSource>,
     pub(crate) processes: Vec<Process>,
 }
 
@@ -65,7 +68,7 @@ impl Settings {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 15] = [
+const KEYS: [&str; 16] = [
     "mes",
     "application_uri",
     "namespace",
@@ -80,6 +83,7 @@ const KEYS: [&str; 15] = [
     "nodesets",
     "manifests",
     "rml",
+    "recipes",
     "processes",
 ];
 
@@ -105,6 +109,7 @@ impl Reading<'_> {
             nodesets,
             manifests,
             rml,
+            recipes,
             processes,
         ] = self.reader.map(root, KEYS)?;
         let name = self
@@ -144,6 +149,7 @@ impl Reading<'_> {
             .map(|node| self.each(node, Self::manifest))
             .unwrap_or_default();
         let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
+        let recipes = recipes.map_or_else(Vec::new, |node| self.each(node, Self::recipe));
         let processes = processes
             .map(|node| self.each(node, Self::process))
             .unwrap_or_default();
@@ -151,6 +157,7 @@ impl Reading<'_> {
         self.once(root, names, "manifest");
         self.files_once(root, &knowledge, &rml);
         let iris = processes.iter().map(|process| &*process.iri);
+        let iris = iris.chain(recipes.iter().map(|recipe| &*recipe.source.name));
         self.once(root, iris, "process");
         Some(Settings {
             name: name?,
@@ -167,6 +174,7 @@ impl Reading<'_> {
             nodesets,
             manifests,
             rml,
+            recipes,
             processes,
         })
     }
@@ -273,45 +281,6 @@ impl Reading<'_> {
         })
     }
 
-    fn job(&mut self, node: &Node) -> Option<skills::Job> {
-        let keys = ["pick", "place", "approach", "shape"];
-        let [pick, place, approach, shape] = self.reader.map(node, keys)?;
-        let pick = self
-            .reader
-            .needed(pick, "pick", node.place)
-            .and_then(|node| self.position(node));
-        let place = self
-            .reader
-            .needed(place, "place", node.place)
-            .and_then(|node| self.position(node));
-        let approach = approach.map_or(Some(USUALLY_APPROACH), |node| {
-            self.reader.number(node, (0.0, 10.0))
-        });
-        let shape = match shape {
-            Some(node) => Some(skills::read_shape(node, &mut self.reader)?),
-            None => None,
-        };
-        Some(skills::Job {
-            pick: pick?,
-            place: place?,
-            approach: approach?,
-            shape,
-        })
-    }
-
-    fn position(&mut self, node: &Node) -> Option<[f64; 6]> {
-        let numbers: Vec<f64> = self.each(node, |reading, node| {
-            reading.reader.number(node, (-1000.0, 1000.0))
-        });
-        numbers.try_into().ok().or_else(|| {
-            self.reader.refuse(
-                node,
-                Code::WrongValue,
-                "a position is six numbers: m, m, m, rad, rad, rad".to_owned(),
-            )
-        })
-    }
-
     /// Reads a step of a composite, or the step with a number that a single skill does; the second
     /// number is that of all steps.
     fn step(
@@ -359,7 +328,7 @@ impl Reading<'_> {
             needs: read,
             parameters: given,
             by,
-            compensation: None,
+            ..Step::default()
         };
         if let Some(node) = compensation {
             self.only_alone(node, kind.is_err(), "retreats by itself")?;
@@ -410,7 +379,7 @@ impl Reading<'_> {
             needs,
             parameters,
             by,
-            compensation: None,
+            ..Step::default()
         })
     }
 

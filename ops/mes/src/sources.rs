@@ -13,6 +13,7 @@ use tracing::{info, warn};
 
 use crate::cell::now;
 use crate::process::Process;
+use crate::recipe::{self, Recipe};
 use crate::settings::{self, Manifest, RmlSource, Settings};
 
 /// The sources, and the findings about them.
@@ -101,6 +102,15 @@ impl Sources {
             named.insert(source.clone());
             self.try_one(source, |source| self.process(source, process));
         }
+        for recipe in &settings.recipes {
+            let source = Source::new(SourceKind::Process, &recipe.source.name);
+            named.insert(source.clone());
+            self.try_one(source, |source| {
+                let bytes = bytes(&recipe.source)?;
+                let read = recipe::read(&decoded(&bytes)?, &recipe.names);
+                self.recipe(source, read, Lasting::No)
+            });
+        }
         let gone: Vec<Source> = {
             let mut state = self.state();
             let before = std::mem::replace(&mut state.of_yaml, named);
@@ -167,11 +177,11 @@ impl Sources {
         Ok(())
     }
 
-    /// Records a finding in a manifest that was read.
+    /// Records a finding in a file that was read.
     fn found(&self, source: &Source, what: String, is_note: bool) {
         match is_note {
-            true => info!(manifest = source.name, "{what}"),
-            false => warn!(manifest = source.name, "{what}"),
+            true => info!(source = source.name, "{what}"),
+            false => warn!(source = source.name, "{what}"),
         }
         let found = finding(source, what, false);
         let mut state = self.state();
@@ -227,6 +237,56 @@ impl Sources {
         self.put(source, &process.triples(&type_iri), Lasting::No)
     }
 
+    /// Adds the processes of a recipe, with its findings.
+    ///
+    /// # Errors
+    /// The first finding, if the recipe has no process; the others are recorded.
+    fn recipe(
+        &self,
+        source: &Source,
+        read: Result<Recipe, Vec<recipe::Finding>>,
+        lasting: Lasting,
+    ) -> Result<(), String> {
+        let recipe = match read {
+            Ok(recipe) => recipe,
+            Err(errors) => {
+                let mut errors = errors.into_iter();
+                let first = errors.next().map(|found| found.to_string());
+                for found in errors {
+                    warn!(source = source.name, "{found}");
+                    let found = finding(source, found.to_string(), true);
+                    let mut state = self.state();
+                    state
+                        .findings
+                        .entry(source.clone())
+                        .or_default()
+                        .push(found);
+                }
+                return Err(first.unwrap_or_default());
+            }
+        };
+        let type_iri =
+            |name: &skills::TypeName| self.knowledge.type_of(&name.namespace, &name.name);
+        let triples = recipe.processes.iter();
+        let triples: Vec<Triple> = triples
+            .flat_map(|process| process.triples(&type_iri))
+            .collect();
+        self.put(source, &triples, lasting)?;
+        for found in &recipe.notes {
+            self.found(source, found.to_string(), true);
+        }
+        for process in &recipe.processes {
+            let (iri, steps) = (&process.iri, process.steps.len());
+            info!(
+                source = source.name,
+                process = iri,
+                steps,
+                "a recipe is a process"
+            );
+        }
+        Ok(())
+    }
+
     fn put(&self, source: &Source, triples: &[Triple], lasting: Lasting) -> Result<(), String> {
         self.knowledge
             .replace_with(source, triples, (now(), lasting))
@@ -268,7 +328,20 @@ impl SourceFiles for Sources {
         self.of_yaml(&source)?;
         let is_new = !self.is_known(&source);
         self.state().findings.remove(&source);
+        let recipe = match kind {
+            SourceKind::Process => recipe::in_source(contents)?,
+            _ => None,
+        };
         match (kind, read) {
+            (SourceKind::Process, _) if recipe.is_some() => {
+                if let Some((text, names)) = recipe {
+                    let read = recipe::read(&text, &names).map_err(|errors| {
+                        let errors: Vec<_> = errors.iter().map(ToString::to_string).collect();
+                        errors.join("; ")
+                    })?;
+                    self.recipe(&source, Ok(read), Lasting::Yes)?;
+                }
+            }
             (SourceKind::NodeSet, Some(read)) => {
                 Self::put(self, &source, &read.triples, Lasting::Yes)?;
             }

@@ -12,15 +12,15 @@ mod write;
 pub(crate) use cell::{Doctor, DriverTemplate, New, StatusArguments, Template};
 pub(crate) use discover::{Discover, Look};
 pub(crate) use live::{
-    Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, PlanArguments, Skills,
+    Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, MesAt, PlanArguments, Skills,
     SkillsVerb, Source, SourceAt, SourceVerb, Target, Top, Trace, Types, WatchSkills,
 };
 pub(crate) use recording::{Record, Replay, Viewers};
 pub(crate) use tap::Tap;
 pub(crate) use write::Write;
 
-pub(crate) use job::{GoalArguments, JobArguments, JobVerb};
-pub(crate) use module::{MtpArguments, MtpRdf, MtpSkills, MtpVerb, PeaArguments};
+pub(crate) use job::{GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb};
+pub(crate) use module::{AasArguments, MtpArguments, MtpRdf, MtpSkills, MtpVerb, PeaArguments};
 
 use std::path::PathBuf;
 
@@ -292,6 +292,12 @@ pub(crate) enum Verb {
     /// time, or the user may not change sources, 74 a file cannot be read or the output cannot be
     /// written.
     Source(Source),
+    /// Import processes from recipes of other programs: BatchML and BPMN
+    ///
+    /// Exit codes: 0 done, with or without notes, 64 usage, 65 the recipe is wrong, or no process
+    /// can have it, 69 no answer in time, or the user may not change sources, 74 a file cannot be
+    /// read or the output cannot be written.
+    Process(ProcessArguments),
     /// Start, list and stop jobs: runs of the processes that ua-mes knows
     ///
     /// Exit codes: 0 done, 1 the job failed (with --wait), 64 usage, or an unknown process or job,
@@ -332,6 +338,14 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, with or without notes, 64 usage, 65 a file is no manifest, or an element
     /// is inconsistent, 74 a file cannot be read or the output cannot be written.
     Mtp(MtpArguments),
+    /// Print the asset administration shell (AAS V3, JSON) of a process module
+    ///
+    /// Its submodels are the digital nameplate, the capabilities of its services, its OPC UA servers
+    /// with their nodes, and the manifest.
+    ///
+    /// Exit codes: 0 done, 64 usage, 65 the file is no manifest, 74 the file cannot be read or the
+    /// output cannot be written.
+    Aas(AasArguments),
     /// Simulate the process module (PEA) of a manifest as an OPC UA server
     ///
     /// Serves all nodes of the manifest, with modes, the state machines of the services and their

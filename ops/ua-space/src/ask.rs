@@ -14,7 +14,7 @@ use crate::survey::look;
 
 /// Runs `ua-space ask`.
 pub(crate) fn ask(arguments: &Ask) -> Result<(), Failure> {
-    let server = Server::parse(&arguments.url)?;
+    let server = Server::parse(&arguments.mes.url)?;
     let query = arguments.sparql.as_deref().map(read).transpose()?;
     look(async {
         let answer = match (query, &arguments.question) {

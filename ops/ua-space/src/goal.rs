@@ -13,7 +13,7 @@ use crate::survey::look;
 
 /// Runs `ua-space goal`.
 pub(crate) fn goal(arguments: &GoalArguments) -> Result<(), Failure> {
-    let server = Server::parse(&arguments.at.url)?;
+    let server = Server::parse(&arguments.at.mes.url)?;
     look(async {
         let path = format!("/goal/{}", encoded(&arguments.goal));
         let answer = server.get(&path).await?;

@@ -116,7 +116,7 @@ async fn jobs(server: &Server) -> Result<(String, Vec<Job>), Failure> {
 
 /// Prints the changes of a job until it ends.
 fn follow(number: u64, at: &SourceAt) -> Result<(), Failure> {
-    let server = Server::parse(&at.url)?;
+    let server = Server::parse(&at.mes.url)?;
     look(async {
         let mut last = None;
         loop {
@@ -139,7 +139,7 @@ fn follow(number: u64, at: &SourceAt) -> Result<(), Failure> {
 }
 
 fn list(json: bool, at: &SourceAt) -> Result<(), Failure> {
-    let server = Server::parse(&at.url)?;
+    let server = Server::parse(&at.mes.url)?;
     look(async {
         let (body, jobs) = jobs(&server).await?;
         let mut out = io::stdout().lock();

@@ -1,5 +1,6 @@
 //! `ua-space`: shows, checks and calls the contents of a running space.
 
+mod aas;
 mod acl;
 mod actions;
 mod arguments;
@@ -37,6 +38,7 @@ mod packet;
 mod page;
 mod pea;
 mod plan;
+mod process;
 mod raw_data;
 mod recorded;
 mod report;
@@ -110,10 +112,12 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Verb::Plan(arguments) => plan::plan(arguments),
         Verb::Source(arguments) => source::source(arguments),
         Verb::Goal(arguments) => goal::goal(arguments),
+        Verb::Process(arguments) => process::process(arguments),
         Verb::Job(arguments) => job::job(arguments),
         Verb::Rml(arguments) => rml::rml(arguments),
         Verb::Owl(arguments) => owl::owl(arguments),
         Verb::Mtp(arguments) => mtp_files::mtp(arguments),
+        Verb::Aas(arguments) => aas::aas(arguments),
         Verb::Pea(arguments) => pea::pea(arguments),
         Verb::Completion(arguments) => completion::script(arguments.shell),
         Verb::Complete(arguments) => completion::complete(&arguments.words),

@@ -13,7 +13,7 @@ use crate::survey::look;
 
 /// Runs `ua-space plan`.
 pub(crate) fn plan(arguments: &PlanArguments) -> Result<(), Failure> {
-    let server = Server::parse(&arguments.url)?;
+    let server = Server::parse(&arguments.mes.url)?;
     look(async {
         let status = get(&server, "/status").await?;
         let known: Status = parsed(&status)?;

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Deserialize;
 
-use crate::arguments::{Source, SourceAt, SourceVerb};
+use crate::arguments::{MesAt, Source, SourceAt, SourceVerb};
 use crate::ask::refusal;
 use crate::exit::Failure;
 use crate::http::{Answer, Change, Server, encoded};
@@ -83,7 +83,7 @@ struct Finding {
 }
 
 fn list(json: bool, at: &SourceAt) -> Result<(), Failure> {
-    let server = Server::parse(&at.url)?;
+    let server = Server::parse(&at.mes.url)?;
     look(async {
         let answer = server.get("/sources").await?;
         if answer.status != 200 {
@@ -149,7 +149,7 @@ struct Violation {
 }
 
 fn check(turtle: bool, json: bool, at: &SourceAt) -> Result<(), Failure> {
-    let server = Server::parse(&at.url)?;
+    let server = Server::parse(&at.mes.url)?;
     look(async {
         let answer = match turtle {
             true => server.get_turtle("/report").await?,
@@ -218,7 +218,7 @@ pub(crate) fn change(
     (content_type, body): (&'static str, Vec<u8>),
     at: &SourceAt,
 ) -> Result<Answer, Failure> {
-    let server = Server::parse(&at.url)?;
+    let server = Server::parse(&at.mes.url)?;
     let user = match (&at.user, &at.password) {
         (Some(user), Some(password)) => Some((user.clone(), password.clone())),
         (None, None) => None,
@@ -254,19 +254,39 @@ fn kind_of(file: &str, contents: &[u8]) -> Result<&'static str, Failure> {
         "aml" | "mtp" | "amlx" => Ok("mtp"),
         "xml" if has(b"UANodeSet") => Ok("nodeset"),
         "xml" if has(b"CAEXFile") => Ok("mtp"),
+        "bpmn" | "batchml" => Ok("process"),
+        "xml" if has(b"http://www.mesa.org/xml/B2MML") || has(b"/spec/BPMN/20100524/MODEL") => {
+            Ok("process")
+        }
         _ => Err(Failure::Usage(format!(
-            "{file}: give its --kind: file (Turtle), nodeset, mtp or process (Turtle)"
+            "{file}: give its --kind: file (Turtle), nodeset, mtp or process (Turtle, or a recipe)"
         ))),
     }
 }
 
-fn plain_name(file: &str) -> Result<String, Failure> {
+/// Returns the findings about a source.
+pub(crate) fn findings(mes: &MesAt, kind: &str, name: &str) -> Result<Vec<String>, Failure> {
+    let server = Server::parse(&mes.url)?;
+    look(async {
+        let answer = server.get("/sources").await?;
+        if answer.status != 200 {
+            return Err(refusal(&answer));
+        }
+        let all: Sources = serde_json::from_str(&answer.body)
+            .map_err(|error| Failure::Data(format!("cannot read the response: {error}")))?;
+        let findings = all.findings.into_iter();
+        let of_source = findings.filter(|found| found.kind == kind && found.source == name);
+        Ok(of_source.map(|found| found.what).collect())
+    })
+}
+
+pub(crate) fn plain_name(file: &str) -> Result<String, Failure> {
     let name = Path::new(file).file_name().and_then(|name| name.to_str());
     name.map(str::to_owned)
         .ok_or_else(|| Failure::Usage(format!("{file}: give the source a name with --as")))
 }
 
-const CREATED: u16 = 201;
+pub(crate) const CREATED: u16 = 201;
 
 #[cfg(test)]
 mod tests {
@@ -288,6 +308,12 @@ mod tests {
             ("A.MTP", "", Some("mtp")),
             ("di.xml", "<UANodeSet>", Some("nodeset")),
             ("m.xml", "<c:CAEXFile>", Some("mtp")),
+            (
+                "b.xml",
+                "<B xmlns='http://www.mesa.org/xml/B2MML'>",
+                Some("process"),
+            ),
+            ("b.bpmn", "", Some("process")),
             ("x.xml", "<html>", None),
             ("-", "", None),
         ] {

@@ -128,6 +128,10 @@ pub const QUESTIONS: &[Question] = &[
         sparql: include_str!("../queries/parameters-of.rq"),
     },
     Question {
+        name: "process-conditions",
+        sparql: include_str!("../queries/process-conditions.rq"),
+    },
+    Question {
         name: "process-parameters",
         sparql: include_str!("../queries/process-parameters.rq"),
     },

@@ -19,6 +19,12 @@ pub fn convert(number: f64, from: &str, to: &str) -> Option<f64> {
     (quantity == wanted).then(|| ((number * factor + zero) - from_zero) / by)
 }
 
+/// Returns whether numbers of a unit, given by its symbol, can be converted.
+#[must_use]
+pub fn is_known(symbol: &str) -> bool {
+    UNITS.iter().any(|unit| unit.0.contains(&symbol.trim()))
+}
+
 /// Returns the units as statements, so that queries can convert numbers: a number times
 /// `ua:factor` plus `ua:zero` is in the SI unit of the quantity.
 #[must_use]
@@ -136,6 +142,7 @@ mod tests {
                 "{from} {to} {converted}"
             );
         }
+        assert!(is_known("l/min") && !is_known("Sekunde"));
         assert_eq!(convert(1.0, "mm", "N"), None);
         assert_eq!(convert(1.0, "furlong", "m"), None);
     }

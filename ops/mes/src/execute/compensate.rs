@@ -157,14 +157,19 @@ impl Execution<'_> {
             format!("{name} cannot be reached: {}", fault.why)
         })?;
         let ended = match skills.first() {
-            Some(skill) => self.one(step, (offer, &**skill), done).await,
+            Some(skill) => match self.prepared(step, offer, done) {
+                Ok(values) => self.one(step, (offer, &**skill), values).await,
+                Err(end) => end,
+            },
             None => StepEnd::Failed("its skill is gone".to_owned()),
         };
         close(opened).await;
         match ended {
             StepEnd::Done(_) => Ok(()),
             StepEnd::Failed(why)
+            | StepEnd::TimedOut(why)
             | StepEnd::Lost(why)
+            | StepEnd::LostInRun(why)
             | StepEnd::Stopped(why)
             | StepEnd::Unresolved(why) => Err(why),
         }

@@ -1,7 +1,9 @@
+mod flow;
+
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use knowledge::{Knowledge, Source, SourceKind};
-use skills::{Outcome, TypeName};
+use skills::{Outcome, SkillFault, TypeName};
 
 use super::*;
 use crate::process::{By, Given, Need, ResultOf, Step};
@@ -20,6 +22,8 @@ struct Fakes {
     halted_at: Mutex<Option<&'static str>>,
     halts: watch::Sender<u32>,
     unreachable: Option<&'static str>,
+    /// Skills named `Meet` wait for each other here.
+    meets: Option<Arc<tokio::sync::Barrier>>,
     journal: Mutex<Vec<String>>,
     kept: Mutex<Vec<Run>>,
     clock: AtomicU64,
@@ -146,6 +150,20 @@ impl Runs for FakeSkill {
             format!("{name} {}", parameters.len())
         };
         self.plant.journal.lock().unwrap().push(told);
+        if let Some(meets) = self
+            .plant
+            .meets
+            .as_ref()
+            .filter(|_| name.ends_with(".Meet"))
+        {
+            let mut halts = self.plant.halts.subscribe();
+            tokio::select! {
+                _ = meets.wait() => {}
+                _ = halts.wait_for(|halts| *halts > 0) => {
+                    return Ok(failed("halted by session 3"));
+                }
+            }
+        }
         let dies = self
             .plant
             .dies_at
@@ -291,6 +309,7 @@ fn plant(offers: Vec<Offer>) -> Fakes {
         halted_at: Mutex::new(None),
         halts: watch::channel(0).0,
         unreachable: None,
+        meets: None,
         journal: Mutex::default(),
         kept: Mutex::default(),
         clock: AtomicU64::new(1000),

@@ -243,6 +243,7 @@ impl<'a> Judging<'a> {
             candidates,
             role_is: need.role,
             is_bound: self.bound.contains_key(&need.role),
+            is_passed: self.situation.is_passed(self.process, need.role),
         }
     }
 

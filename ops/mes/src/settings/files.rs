@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use skills::yaml::{Code, Kind, Node};
 
 use super::Reading;
+use crate::recipe::Names;
 
 /// A file, with its name in the YAML.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -21,6 +22,14 @@ pub(crate) struct RmlSource {
     pub(crate) mapping: Source,
     /// The file in the place of the only file that the mapping names.
     pub(crate) file: Option<Source>,
+}
+
+/// A recipe of BatchML or BPMN.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct RecipeSource {
+    pub(crate) source: Source,
+    /// Names of the file, with the names that they stand for.
+    pub(crate) names: Names,
 }
 
 /// The manifest of a module.
@@ -90,6 +99,42 @@ impl Reading<'_> {
         Some(RmlSource {
             mapping: self.source(name, mapping),
             file: file.map(|file| self.source(file, file)),
+        })
+    }
+
+    /// Reads a recipe: its path, or a map.
+    pub(super) fn recipe(&mut self, node: &Node) -> Option<RecipeSource> {
+        if !matches!(node.kind, Kind::Map(_)) {
+            let path = self.reader.text(node, "the path of a recipe, or a map")?;
+            return Some(RecipeSource {
+                source: self.source(path, path),
+                names: Names::new(),
+            });
+        }
+        let [file, names] = self.reader.map(node, ["file", "names"])?;
+        let file = self.reader.needed(file, "file", node.place)?;
+        let file = self.reader.text(file, "the path of a recipe")?;
+        let mut given = Names::new();
+        if let Some(node) = names {
+            let Kind::Map(pairs) = &node.kind else {
+                self.reader
+                    .wrong(node, "a map from names of the recipe to names here");
+                return None;
+            };
+            for (name, stands_for) in pairs {
+                let name = self.reader.text(name, "a name of the recipe");
+                let stands_for = self.reader.text(
+                    stands_for,
+                    "a capability, a type of skills, a parameter or a unit",
+                );
+                if let (Some(name), Some(stands_for)) = (name, stands_for) {
+                    given.insert(name.to_owned(), stands_for.to_owned());
+                }
+            }
+        }
+        Some(RecipeSource {
+            source: self.source(file, file),
+            names: given,
         })
     }
 

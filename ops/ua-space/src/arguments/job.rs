@@ -49,6 +49,34 @@ pub(crate) enum JobVerb {
 }
 
 #[derive(Debug, Args)]
+pub(crate) struct ProcessArguments {
+    #[command(subcommand)]
+    pub(crate) verb: ProcessVerb,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ProcessVerb {
+    /// Add the processes of a recipe of BatchML or BPMN to ua-mes, and print what is left out
+    ///
+    /// A recipe that no process can have is refused; each of its elements that has no place in a
+    /// process is printed with its line. `ua-space plan` shows which skills would do the steps.
+    Import {
+        /// The recipe, or - for stdin
+        #[arg(value_name = "FILE")]
+        file: String,
+        /// A name of the recipe, and what it stands for: the IRI of a capability, a type of skills,
+        /// a parameter or a unit, as Sekunde=s; can be repeated
+        #[arg(long = "name", value_name = "NAME=NAME")]
+        names: Vec<String>,
+        /// The name of the source; the name of the file unless given
+        #[arg(long = "as", value_name = "NAME")]
+        source: Option<String>,
+        #[command(flatten)]
+        at: SourceAt,
+    },
+}
+
+#[derive(Debug, Args)]
 pub(crate) struct GoalArguments {
     /// The IRI of the goal
     #[arg(value_name = "GOAL")]

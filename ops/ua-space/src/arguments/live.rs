@@ -277,14 +277,8 @@ pub(crate) struct Ask {
     /// Run this query of SPARQL 1.1 in a file, or - for stdin
     #[arg(long, value_name = "FILE")]
     pub(crate) sparql: Option<String>,
-    /// The URL of ua-mes
-    #[arg(
-        long,
-        value_name = "URL",
-        env = "UA_SPARQL",
-        default_value = "http://127.0.0.1:8087"
-    )]
-    pub(crate) url: String,
+    #[command(flatten)]
+    pub(crate) mes: MesAt,
     /// Print the response unchanged
     #[arg(long)]
     pub(crate) json: bool,
@@ -295,14 +289,8 @@ pub(crate) struct PlanArguments {
     /// The process: its IRI, its name, or the last part of its IRI
     #[arg(value_name = "PROCESS")]
     pub(crate) process: Option<String>,
-    /// The URL of ua-mes
-    #[arg(
-        long,
-        value_name = "URL",
-        env = "UA_SPARQL",
-        default_value = "http://127.0.0.1:8087"
-    )]
-    pub(crate) url: String,
+    #[command(flatten)]
+    pub(crate) mes: MesAt,
     /// Print the response of the MES
     #[arg(long)]
     pub(crate) json: bool,
@@ -326,11 +314,12 @@ pub(crate) enum SourceVerb {
     },
     /// Add or replace a source
     Add {
-        /// A NodeSet, a manifest (.aml, .mtp, .amlx), Turtle (.ttl), or XML with --rml; - for stdin
+        /// A NodeSet, a manifest (.aml, .mtp, .amlx), Turtle (.ttl), a recipe (BatchML, BPMN), or XML
+        /// with --rml; - for stdin
         #[arg(value_name = "FILE")]
         file: String,
-        /// file (Turtle), nodeset, mtp or process (Turtle); found by the name and contents of the
-        /// file
+        /// file (Turtle), nodeset, mtp or process (Turtle, or a recipe); found by the name and
+        /// contents of the file
         #[arg(long, value_name = "KIND")]
         kind: Option<String>,
         /// The name of the source; the name of the file unless given. A NodeSet is named by its
@@ -378,8 +367,9 @@ pub(crate) enum SourceVerb {
     },
 }
 
+/// Where ua-mes answers.
 #[derive(Debug, Args)]
-pub(crate) struct SourceAt {
+pub(crate) struct MesAt {
     /// The URL of ua-mes
     #[arg(
         long,
@@ -388,6 +378,12 @@ pub(crate) struct SourceAt {
         default_value = "http://127.0.0.1:8087"
     )]
     pub(crate) url: String,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SourceAt {
+    #[command(flatten)]
+    pub(crate) mes: MesAt,
     /// The user, where ua-mes has users; the password is in UA_PASSWORD
     #[arg(long, value_name = "NAME", env = "UA_USER")]
     pub(crate) user: Option<String>,

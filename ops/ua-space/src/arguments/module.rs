@@ -55,6 +55,21 @@ pub(crate) struct MtpSkills {
 }
 
 #[derive(Debug, Args)]
+pub(crate) struct AasArguments {
+    /// The manifest (.aml, .mtp, .amlx)
+    #[arg(value_name = "FILE")]
+    pub(crate) file: String,
+    /// The IRI of the asset, with which the IRIs of the shell and its submodels begin. Without it
+    /// urn:ua-bridge:mtp:<name of the file>
+    #[arg(long, value_name = "IRI", value_parser = iri)]
+    pub(crate) id: Option<String>,
+    /// A field of the nameplate that the manifest does not have, as ManufacturerName=Maker; can be
+    /// repeated. Without all mandatory fields the nameplate is left out
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub(crate) nameplate: Vec<String>,
+}
+
+#[derive(Debug, Args)]
 pub(crate) struct PeaArguments {
     /// The manifest (.aml, .mtp, .amlx)
     #[arg(value_name = "FILE")]

@@ -1,0 +1,326 @@
+//! The steps of a sequence: each begins when the steps that it waits for are over, and its
+//! conditions hold. Steps that do not wait for each other run in parallel.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use futures_util::stream::{FuturesUnordered, StreamExt as _};
+use skills::{PartEnd, Runs, SkillFault, Value, run_part};
+use tracing::info;
+
+use super::compensate::{self, Done};
+use super::{Chosen, Ended, Execution, Fallen, Offer, Role, Step};
+use crate::process::{BadEnd, Condition, Process, Test};
+
+/// The steps of a run that are over.
+#[derive(Debug, Default)]
+pub(super) struct Progress {
+    /// In the order in which they ended.
+    pub(super) done: Vec<Done>,
+    /// The other steps, by their numbers.
+    pub(super) passed: BTreeMap<usize, Passed>,
+}
+
+/// The reason why the process goes on behind a step that is not done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Passed {
+    /// Its conditions did not hold.
+    Skipped,
+    /// Other steps handle its end, which is confirmed.
+    Ended(BadEnd),
+}
+
+impl Progress {
+    pub(super) fn is_over(&self, number: usize) -> bool {
+        self.passed.contains_key(&number) || self.done.iter().any(|done| done.number == number)
+    }
+
+    /// Returns whether one of the alternatives of a step holds.
+    ///
+    /// # Errors
+    /// The condition that cannot be decided.
+    fn allows(&self, process: &Process, step: &Step) -> Result<bool, String> {
+        if step.when.is_empty() {
+            return Ok(true);
+        }
+        for alternative in &step.when {
+            let mut holds = true;
+            // The conditions of an outer branch come first: an inner condition is not decidable
+            // when its branch was not taken.
+            for condition in alternative {
+                if !self.holds(process, condition)? {
+                    holds = false;
+                    break;
+                }
+            }
+            if holds {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    fn holds(&self, process: &Process, condition: &Condition) -> Result<bool, String> {
+        let test = match &condition.test {
+            Test::Ended(end) => self.passed.get(&condition.step) == Some(&Passed::Ended(*end)),
+            Test::Result {
+                name,
+                compare,
+                value,
+            } => {
+                let of = process.steps.get(condition.step);
+                let of = of.map_or("", |step| step.name.as_str());
+                let mut done = self.done.iter();
+                let done = done.find(|done| done.number == condition.step);
+                let done = done.ok_or_else(|| format!("`{of}` is not done, and has no {name}"))?;
+                let mut results = done.results.iter();
+                let result = results.find(|(known, _)| known == name);
+                let (_, result) =
+                    result.ok_or_else(|| format!("`{of}` returned no result {name}"))?;
+                let holds = compare.holds(&result.to_json(), value);
+                holds.map_err(|why| format!("{name} of `{of}`: {why}"))?
+            }
+        };
+        Ok(test != condition.is_negated)
+    }
+}
+
+/// The end of a step.
+pub(super) enum StepEnd {
+    /// With its results.
+    Done(Vec<(String, Value)>),
+    /// The caller stopped the run.
+    Stopped(String),
+    /// An earlier step did not return a result.
+    Unresolved(String),
+    Failed(String),
+    /// It was halted after its time limit.
+    TimedOut(String),
+    /// Its component is lost.
+    Lost(String),
+    /// Its component is lost, and its skill may go on.
+    LostInRun(String),
+}
+
+/// A step that can begin: its number, and its place among the chosen skills.
+type Ready = (usize, usize);
+
+impl Execution<'_> {
+    /// Runs the steps that are not over. When a step fails, no other step begins, and the running
+    /// steps are awaited.
+    pub(super) async fn sequence(
+        &self,
+        chosen: &Chosen,
+        skills: &[Arc<dyn Runs>],
+        progress: &mut Progress,
+    ) -> Ended {
+        let mut running = FuturesUnordered::new();
+        let mut begun: BTreeMap<usize, &str> = BTreeMap::new();
+        let mut ended = Ended::Done;
+        loop {
+            while matches!(ended, Ended::Done) {
+                let (number, place) = match self.ready(chosen, &begun, &mut *progress) {
+                    Ok(Some(ready)) => ready,
+                    Ok(None) => break,
+                    Err(why) => {
+                        ended = Ended::Over(why);
+                        break;
+                    }
+                };
+                let (Some((_, offer)), Some(skill), Some(step)) = (
+                    chosen.open.get(place),
+                    skills.get(place),
+                    self.process.steps.get(number),
+                ) else {
+                    ended = Ended::Over("the plan has another step than the process".to_owned());
+                    break;
+                };
+                begun.insert(number, &offer.component);
+                match self.prepared(step, offer, &progress.done) {
+                    Ok(values) => running.push(async move {
+                        self.teller.step("Step").await;
+                        let end = self.one(step, (offer, &**skill), values).await;
+                        (number, offer, end)
+                    }),
+                    Err(end) => {
+                        begun.remove(&number);
+                        self.over((number, offer), end, (chosen, &mut *progress), &mut ended);
+                    }
+                }
+            }
+            let Some((number, offer, end)) = running.next().await else {
+                break;
+            };
+            begun.remove(&number);
+            self.over((number, offer), end, (chosen, &mut *progress), &mut ended);
+        }
+        let mut left = 0..self.process.steps.len();
+        match ended {
+            Ended::Done if left.any(|number| !progress.is_over(number)) => {
+                Ended::Over("steps of the process wait for each other".to_owned())
+            }
+            ended => ended,
+        }
+    }
+
+    /// Returns a step that can begin. Steps whose conditions do not hold are skipped. A component
+    /// does one step at a time.
+    fn ready(
+        &self,
+        chosen: &Chosen,
+        begun: &BTreeMap<usize, &str>,
+        progress: &mut Progress,
+    ) -> Result<Option<Ready>, String> {
+        let busy: BTreeSet<&str> = begun.values().copied().collect();
+        for (number, step) in self.process.steps.iter().enumerate() {
+            let mut waits = step.waits_for(number).into_iter();
+            let is_waiting = waits.any(|other| !progress.is_over(other));
+            if progress.is_over(number) || begun.contains_key(&number) || is_waiting {
+                continue;
+            }
+            let allows = progress.allows(self.process, step);
+            if !allows.map_err(|why| format!("{}: {why}", step.name))? {
+                info!(
+                    step = step.name,
+                    "a step is skipped: its conditions do not hold"
+                );
+                progress.passed.insert(number, Passed::Skipped);
+                continue;
+            }
+            let mut open = chosen.open.iter();
+            let place = open.position(|(role, _)| *role == Role::Alone(number));
+            let place =
+                place.ok_or_else(|| "the plan has another step than the process".to_owned())?;
+            let offer = chosen.open.get(place).map(|(_, offer)| offer);
+            if offer.is_some_and(|offer| !busy.contains(offer.component.as_str())) {
+                return Ok(Some((number, place)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Records the end of a step.
+    fn over(
+        &self,
+        (number, offer): (usize, &Offer),
+        end: StepEnd,
+        (chosen, progress): (&Chosen, &mut Progress),
+        ended: &mut Ended,
+    ) {
+        // The machine of a step whose end is unknown may move: no other step handles it.
+        let handled = |end| {
+            let is_known = !self.log.run().is_unknown();
+            is_known && self.process.handles(number, end)
+        };
+        let (bad, why) = match end {
+            StepEnd::Done(results) => {
+                progress.done.push(Done {
+                    number,
+                    offer: offer.clone(),
+                    undo: chosen.undo.get(&number).cloned(),
+                    results,
+                });
+                return;
+            }
+            StepEnd::Failed(why) => (Some(BadEnd::Failed), Ended::Broken(why)),
+            StepEnd::TimedOut(why) if self.process.handles(number, BadEnd::TimedOut) => {
+                (Some(BadEnd::TimedOut), Ended::Broken(why))
+            }
+            StepEnd::TimedOut(why) => (Some(BadEnd::Failed), Ended::Broken(why)),
+            StepEnd::Lost(why) => (None, Ended::Broken(why)),
+            // Another component must not repeat the step.
+            StepEnd::Stopped(why) | StepEnd::Unresolved(why) | StepEnd::LostInRun(why) => {
+                (None, Ended::Over(why))
+            }
+        };
+        if let Some(bad) = bad.filter(|bad| handled(*bad)) {
+            info!(
+                step = number,
+                end = bad.name(),
+                "other steps handle the end of a step"
+            );
+            progress.passed.insert(number, Passed::Ended(bad));
+            return;
+        }
+        ended.and(why);
+    }
+
+    /// Returns the parameters of a step, or the end of a step that cannot begin.
+    pub(super) fn prepared(
+        &self,
+        step: &Step,
+        offer: &Offer,
+        done: &[Done],
+    ) -> Result<Vec<(String, Value)>, StepEnd> {
+        let given = compensate::resolved(self.plant, step, done)
+            .map_err(|why| StepEnd::Unresolved(format!("{}: {why}", step.name)))?;
+        self.plant.values(&offer.skill, &given).map_err(|why| {
+            self.log.fell(Fallen {
+                component: offer.component.clone(),
+                since_ms: offer.since_ms,
+                skill: Some(offer.skill.clone()),
+                why: format!("it does not take the parameters: {why}"),
+            });
+            StepEnd::Failed(format!("{}: {why}", step.name))
+        })
+    }
+
+    /// Runs the skill of a step or of a compensation to its end.
+    pub(super) async fn one(
+        &self,
+        step: &Step,
+        (offer, skill): (&Offer, &dyn Runs),
+        values: Vec<(String, Value)>,
+    ) -> StepEnd {
+        let before = self.log.ran(&offer.skill);
+        // The skill records the step at its first poll, which follows without a pause.
+        self.log.step(&step.name);
+        let within = step.within.unwrap_or(self.process.within);
+        let part = run_part(skill, values, within, self, self.teller.stopped());
+        let outcome = match part.await {
+            PartEnd::Ended(outcome) => outcome,
+            PartEnd::Interrupted { halted: Ok(()), .. } => {
+                return StepEnd::Stopped("stopped".to_owned());
+            }
+            PartEnd::Interrupted {
+                halted: Err(fault), ..
+            } => {
+                let name = skill.name();
+                return StepEnd::Stopped(format!("stopped, but {name} may go on: {fault}"));
+            }
+        };
+        let (fault, why) = match outcome {
+            Ok(outcome) if outcome.succeeded => return StepEnd::Done(outcome.results),
+            Ok(outcome) => (None, outcome.message),
+            Err(fault) => {
+                let why = fault.to_string();
+                (Some(fault), why)
+            }
+        };
+        let why = format!("{}: {} {why}", step.name, skill.name());
+        match fault {
+            Some(SkillFault::Lost(_)) if self.log.ran(&offer.skill) > before => {
+                StepEnd::LostInRun(why)
+            }
+            Some(SkillFault::Lost(_)) => StepEnd::Lost(why),
+            Some(SkillFault::TimedOut(_)) => StepEnd::TimedOut(why),
+            _ => StepEnd::Failed(why),
+        }
+    }
+}
+
+impl Ended {
+    /// Adds the end of another step. No other plan can do the work if it cannot for one of them.
+    fn and(&mut self, other: Self) {
+        *self = match (std::mem::replace(self, Self::Done), other) {
+            (Self::Done, other) => other,
+            (before, Self::Done) => before,
+            (Self::Broken(one), Self::Broken(two)) => Self::Broken(format!("{one}; {two}")),
+            // All running steps are stopped together.
+            (Self::Over(one), Self::Over(two)) if one == two => Self::Over(one),
+            (Self::Broken(one) | Self::Over(one), Self::Broken(two) | Self::Over(two)) => {
+                Self::Over(format!("{one}; {two}"))
+            }
+        };
+    }
+}

@@ -1,0 +1,715 @@
+//! Master and control recipes of BatchML (B2MML, `BatchInformation`).
+//!
+//! Steps and transitions have the meaning of a sequential function chart: a transition with several
+//! steps before it waits for all of them, and a step with several transitions behind it takes the
+//! first whose condition holds. Recipe elements with a procedure logic of their own are replaced by
+//! it; the others are steps.
+
+use std::collections::BTreeMap;
+
+use knowledge::units;
+use mtp::escaped;
+use roxmltree::Node;
+use serde_json::Value;
+
+use super::flow::{Flow, NodeCondition, NodeKind};
+use super::values::{self, Written};
+use super::{Reading, child, children, text_of};
+use crate::process::{Given, Job, Need, Process, ResultOf, Role, Step};
+use crate::read_process::{USUALLY_WAIT, USUALLY_WITHIN};
+
+pub(super) const NAMESPACE: &str = "http://www.mesa.org/xml/B2MML";
+
+/// A recipe that is being read.
+struct RecipeParts<'d> {
+    /// The parameters of its formula by their IDs.
+    formula: BTreeMap<&'d str, Node<'d, 'd>>,
+    /// Recipe elements that other elements refer to.
+    blocks: Vec<Node<'d, 'd>>,
+    flow: Flow,
+    /// The nodes of the steps by the IDs of the steps; `None` if several steps have the ID.
+    steps: BTreeMap<&'d str, Option<usize>>,
+    /// Parameters with the result of a step: the node, the place among its parameters, the ID of
+    /// the other step, and the offset.
+    results: Vec<(usize, usize, String, usize)>,
+}
+
+/// The first and the last node of a procedure logic.
+type Ends = (usize, usize);
+
+impl<'d> Reading<'d> {
+    /// Reads all recipes of a file.
+    pub(super) fn batchml(&mut self, root: Node<'d, 'd>) -> Vec<Process> {
+        let is_recipe = |node: &Node<'_, '_>| {
+            ["MasterRecipe", "ControlRecipe"].contains(&node.tag_name().name())
+        };
+        if is_recipe(&root) {
+            return self.recipe(root, Vec::new()).into_iter().collect();
+        }
+        self.only(
+            root,
+            &[
+                "Description",
+                "MasterRecipe",
+                "ControlRecipe",
+                "RecipeBuildingBlock",
+            ],
+        );
+        let blocks = children(root, "RecipeBuildingBlock");
+        let blocks: Vec<_> = blocks
+            .flat_map(|block| children(block, "RecipeElement"))
+            .collect();
+        let recipes: Vec<_> = root.children().filter(is_recipe).collect();
+        let processes = recipes.into_iter();
+        processes
+            .filter_map(|recipe| self.recipe(recipe, blocks.clone()))
+            .collect()
+    }
+
+    fn recipe(&mut self, recipe: Node<'d, 'd>, blocks: Vec<Node<'d, 'd>>) -> Option<Process> {
+        self.only(
+            recipe,
+            &[
+                "ID",
+                "Version",
+                "VersionDate",
+                "Description",
+                "BatchID",
+                "EquipmentRequirement",
+                "Formula",
+                "ProcedureLogic",
+                "RecipeElement",
+            ],
+        );
+        self.constraints(recipe);
+        let id = text_of(recipe, "ID");
+        if id.is_empty() {
+            self.error(recipe, "the recipe has no ID".to_owned());
+            return None;
+        }
+        let parameters = child(recipe, "Formula").into_iter();
+        let parameters = parameters.flat_map(|formula| children(formula, "Parameter"));
+        let mut parts = RecipeParts {
+            formula: parameters.map(|node| (text_of(node, "ID"), node)).collect(),
+            blocks,
+            flow: Flow::default(),
+            steps: BTreeMap::new(),
+            results: Vec::new(),
+        };
+        let start = parts.flow.node(recipe.range().start, id, NodeKind::Start);
+        let (first, _) = self.logic(recipe, &mut parts, &mut vec![recipe])?;
+        parts
+            .flow
+            .edge(start, first, recipe.range().start, Vec::new());
+        let RecipeParts {
+            mut flow,
+            steps,
+            results,
+            ..
+        } = parts;
+        for (node, parameter, of, at) in results {
+            let Some(step) = steps.get(of.as_str()).copied().flatten() else {
+                self.error_at(
+                    at,
+                    format!(
+                        "the value refers to the step `{of}`, which is unknown or not the only one"
+                    ),
+                );
+                continue;
+            };
+            if let Some(NodeKind::Task(task)) = flow.nodes.get_mut(node).map(|node| &mut node.kind)
+                && let Some(result) = task
+                    .parameters
+                    .get_mut(parameter)
+                    .and_then(|given| given.result.as_mut())
+            {
+                result.step = step;
+            }
+        }
+        let steps = self.steps(&flow)?;
+        let description = text_of(recipe, "Description");
+        let named = self.named(id);
+        let iri = match knowledge::is_iri(named) {
+            true => named.to_owned(),
+            false => format!("urn:ua-bridge:recipe:{}", escaped(id)),
+        };
+        Some(Process {
+            iri,
+            name: if description.is_empty() {
+                id
+            } else {
+                description
+            }
+            .to_owned(),
+            work: Job::Sequence,
+            steps,
+            within: USUALLY_WITHIN,
+            wait: USUALLY_WAIT,
+        })
+    }
+
+    /// Adds the steps of a recipe or of a recipe element. `open` has the elements around it.
+    fn logic(
+        &mut self,
+        parent: Node<'d, 'd>,
+        parts: &mut RecipeParts<'d>,
+        open: &mut Vec<Node<'d, 'd>>,
+    ) -> Option<Ends> {
+        let name = text_of(parent, "ID");
+        let at = parent.range().start;
+        let Some(logic) = child(parent, "ProcedureLogic") else {
+            let what = format!("`{name}` has recipe elements, and no ProcedureLogic orders them");
+            self.error(parent, what);
+            return None;
+        };
+        self.only(logic, &["Link", "Step", "Transition"]);
+        let first = parts.flow.node(at, name, NodeKind::Merge);
+        let last = parts.flow.node(at, name, NodeKind::Merge);
+        let mut places: BTreeMap<(&str, &str), Ends> = BTreeMap::new();
+        let mut conditions: BTreeMap<usize, Node<'d, 'd>> = BTreeMap::new();
+        for step in children(logic, "Step") {
+            self.only(
+                step,
+                &[
+                    "ID",
+                    "RecipeElementID",
+                    "RecipeElementVersion",
+                    "Description",
+                ],
+            );
+            let ends = self.step(step, parent, parts, open)?;
+            if places.insert(("Step", text_of(step, "ID")), ends).is_some() {
+                self.error(
+                    step,
+                    format!("there are two steps `{}`", text_of(step, "ID")),
+                );
+            }
+        }
+        for transition in children(logic, "Transition") {
+            self.only(
+                transition,
+                &["ID", "Condition", "ConditionAnnotation", "Description"],
+            );
+            let id = text_of(transition, "ID");
+            let node = parts
+                .flow
+                .node(transition.range().start, id, NodeKind::Join);
+            conditions.insert(node, transition);
+            places.insert(("Transition", id), (node, node));
+        }
+        for link in children(logic, "Link") {
+            let kind = match text_of(link, "LinkType") {
+                "ControlLink" | "ParallelDivergent" | "SerialDivergent" | "SerialConvergent" => {
+                    NodeKind::Merge
+                }
+                "ParallelConvergent" => NodeKind::Join,
+                other => {
+                    let id = text_of(link, "ID");
+                    let what = format!(
+                        "the link `{id}` has the LinkType `{other}`; links of control only are supported"
+                    );
+                    self.error(link, what);
+                    continue;
+                }
+            };
+            let id = text_of(link, "ID");
+            let node = parts.flow.node(link.range().start, id, kind);
+            places.insert(("Link", id), (node, node));
+        }
+        for link in children(logic, "Link") {
+            self.only(
+                link,
+                &[
+                    "ID",
+                    "FromID",
+                    "ToID",
+                    "LinkType",
+                    "Depiction",
+                    "EvaluationOrder",
+                    "Description",
+                ],
+            );
+            let Some((node, _)) = places.get(&("Link", text_of(link, "ID"))).copied() else {
+                continue;
+            };
+            let at = link.range().start;
+            for (end, value, kind) in [
+                ("FromID", "FromIDValue", "FromType"),
+                ("ToID", "ToIDValue", "ToType"),
+            ] {
+                for named in children(link, end) {
+                    let (kind, value) = (text_of(named, kind), text_of(named, value));
+                    match places.get(&(kind, value)) {
+                        Some((_, last)) if end == "FromID" => {
+                            parts.flow.edge(*last, node, at, Vec::new());
+                        }
+                        Some((first, _)) => parts.flow.edge(node, *first, at, Vec::new()),
+                        None => {
+                            let what =
+                                format!("the link names the {kind} `{value}`, which is unknown");
+                            self.error(named, what);
+                        }
+                    }
+                }
+            }
+        }
+        let mut own: Vec<usize> = places
+            .values()
+            .flat_map(|(one, other)| [*one, *other])
+            .collect();
+        own.sort_unstable();
+        own.dedup();
+        self.transitions(&places, &conditions, parts);
+        // A step to which no link leads would begin at once: only one step does.
+        let is_first = |ends: &&Ends| {
+            let mut edges = parts.flow.edges.iter();
+            !edges.any(|edge| edge.to == ends.0 && own.contains(&edge.from))
+        };
+        let starts: Vec<usize> = places
+            .values()
+            .filter(is_first)
+            .map(|ends| ends.0)
+            .collect();
+        if starts.len() > 1 {
+            let names = starts.iter().filter_map(|node| parts.flow.nodes.get(*node));
+            let names: Vec<&str> = names.map(|node| node.name.as_str()).collect();
+            let what = format!(
+                "no link leads to {}; only one step can be the first",
+                names.join(", ")
+            );
+            self.error(logic, what);
+        }
+        for start in starts {
+            parts.flow.edge(first, start, at, Vec::new());
+        }
+        // The steps without anything behind them are the last ones.
+        let is_left = |ends: &&Ends| {
+            let mut edges = parts.flow.edges.iter();
+            !edges.any(|edge| edge.from == ends.1 && own.contains(&edge.to))
+        };
+        let left: Vec<usize> = places.values().filter(is_left).map(|ends| ends.1).collect();
+        // Several ends that run in parallel are awaited together at the last node.
+        for end in left {
+            parts.flow.edge(end, last, at, Vec::new());
+        }
+        if places.is_empty() {
+            parts.flow.edge(first, last, at, Vec::new());
+        }
+        Some((first, last))
+    }
+
+    /// Sets the conditions of the flows behind transitions. Of several transitions behind a step
+    /// the first whose condition holds is taken.
+    fn transitions(
+        &mut self,
+        places: &BTreeMap<(&'d str, &'d str), Ends>,
+        conditions: &BTreeMap<usize, Node<'d, 'd>>,
+        parts: &mut RecipeParts<'d>,
+    ) {
+        for ((kind, _), (_, step)) in places {
+            if *kind != "Step" {
+                continue;
+            }
+            // Links between a step and its transitions are nodes of their own.
+            let mut behind: Vec<usize> = Vec::new();
+            let mut look = vec![*step];
+            let mut seen = Vec::new();
+            while let Some(from) = look.pop() {
+                for edge in parts.flow.edges.iter().filter(|edge| edge.from == from) {
+                    if conditions.contains_key(&edge.to) {
+                        behind.push(edge.to);
+                    } else if !seen.contains(&edge.to) {
+                        seen.push(edge.to);
+                        let is_link = places
+                            .iter()
+                            .any(|((kind, _), (node, _))| *kind == "Link" && *node == edge.to);
+                        look.extend(is_link.then_some(edge.to));
+                    }
+                }
+            }
+            behind.sort_unstable();
+            behind.dedup();
+            let count = behind.len();
+            let mut own: Vec<Vec<NodeCondition>> = Vec::new();
+            for (number, node) in behind.iter().enumerate() {
+                let Some(transition) = conditions.get(node).copied() else {
+                    continue;
+                };
+                let condition = self.transition(transition, parts);
+                let is_last = number + 1 == count;
+                if count == 1 && condition.is_some() {
+                    let id = text_of(transition, "ID");
+                    let what = format!(
+                        "the transition `{id}` waits until a value has changed, which is not \
+                         supported; use a phase that ends then"
+                    );
+                    self.error(transition, what);
+                } else if count > 1 && (is_last == condition.is_some()) {
+                    let id = text_of(transition, "ID");
+                    let what = format!(
+                        "of several transitions only the last has the condition True, and `{id}` {}",
+                        if is_last {
+                            "has another one"
+                        } else {
+                            "has it too"
+                        }
+                    );
+                    self.error(transition, what);
+                }
+                own.push(condition.into_iter().collect());
+            }
+            if count < 2 {
+                continue;
+            }
+            for (node, when) in behind.into_iter().zip(Flow::exclusive(own)) {
+                for edge in parts.flow.edges.iter_mut().filter(|edge| edge.from == node) {
+                    edge.when.clone_from(&when);
+                }
+            }
+        }
+    }
+
+    /// Reads the condition of a transition; `None` if it holds when the steps before it are done.
+    fn transition(
+        &mut self,
+        transition: Node<'d, 'd>,
+        parts: &RecipeParts<'d>,
+    ) -> Option<NodeCondition> {
+        let text = text_of(transition, "Condition");
+        let is_completed = text.starts_with("Step ") && text.ends_with(" is Completed");
+        if text.is_empty() || text.eq_ignore_ascii_case("true") || is_completed {
+            return None;
+        }
+        let node = |step: &str| parts.steps.get(step).copied().flatten();
+        match values::condition(text, &node) {
+            Ok(condition) => Some(condition),
+            Err(why) => {
+                self.error(transition, why);
+                None
+            }
+        }
+    }
+
+    /// Adds a step with its recipe element.
+    fn step(
+        &mut self,
+        step: Node<'d, 'd>,
+        parent: Node<'d, 'd>,
+        parts: &mut RecipeParts<'d>,
+        open: &mut Vec<Node<'d, 'd>>,
+    ) -> Option<Ends> {
+        let (id, of) = (text_of(step, "ID"), text_of(step, "RecipeElementID"));
+        let element = open
+            .iter()
+            .rev()
+            .copied()
+            .chain([parent])
+            .flat_map(|node| children(node, "RecipeElement"))
+            .find(|element| text_of(*element, "ID") == of);
+        let Some(element) = element else {
+            let what = format!("the step `{id}` has the recipe element `{of}`, which is unknown");
+            self.error(step, what);
+            return None;
+        };
+        self.only(
+            element,
+            &[
+                "ID",
+                "Version",
+                "VersionDate",
+                "Description",
+                "RecipeElementType",
+                "BuildingBlockElementID",
+                "BuildingBlockElementVersion",
+                "ActualEquipmentID",
+                "EquipmentRequirement",
+                "Parameter",
+                "ProcedureLogic",
+                "RecipeElement",
+            ],
+        );
+        self.constraints(element);
+        let block_id = text_of(element, "BuildingBlockElementID");
+        let mut blocks = parts.blocks.iter();
+        let block = blocks.find(|block| !block_id.is_empty() && text_of(**block, "ID") == block_id);
+        let nested = [Some(element), block.copied()]
+            .into_iter()
+            .flatten()
+            .find(|node| {
+                child(*node, "ProcedureLogic").is_some() || child(*node, "RecipeElement").is_some()
+            });
+        let at = step.range().start;
+        if let Some(nested) = nested {
+            if open.contains(&nested) || open.len() >= MOST_LEVELS {
+                let what = format!(
+                    "the recipe element `{of}` contains itself, or more than {MOST_LEVELS} levels"
+                );
+                self.error(step, what);
+                return None;
+            }
+            open.push(nested);
+            let ends = self.logic(nested, parts, open);
+            open.pop();
+            return ends;
+        }
+        match text_of(element, "RecipeElementType") {
+            "Begin" | "End" => {
+                let node = parts.flow.node(at, id, NodeKind::Merge);
+                return Some((node, node));
+            }
+            "Allocation" => {
+                let what = format!(
+                    "the allocation `{of}` is left out: the plan chooses and reserves components"
+                );
+                self.note(element, what);
+                let node = parts.flow.node(at, id, NodeKind::Merge);
+                return Some((node, node));
+            }
+            _ => {}
+        }
+        let need = self.need_of(element, block_id)?;
+        let node = parts.flow.nodes.len();
+        let parameters = self.parameters(element, node, parts);
+        let description = text_of(step, "Description");
+        let name = if description.is_empty() {
+            id
+        } else {
+            description
+        };
+        let task = Step {
+            name: name.to_owned(),
+            needs: vec![need],
+            parameters,
+            ..Step::default()
+        };
+        let node = parts.flow.node(at, id, NodeKind::Task(Box::new(task)));
+        let known = parts.steps.entry(id);
+        known
+            .and_modify(|known| *known = None)
+            .or_insert(Some(node));
+        Some((node, node))
+    }
+
+    /// Returns the capability or the type of skills of a recipe element.
+    fn need_of(&mut self, element: Node<'d, 'd>, block: &'d str) -> Option<Need> {
+        let (id, description) = (text_of(element, "ID"), text_of(element, "Description"));
+        let required = children(element, "EquipmentRequirement");
+        let required: Vec<&str> = required.map(|node| text_of(node, "ID")).collect();
+        let named = [id, block, description].into_iter().chain(required);
+        let need = named
+            .filter(|name| !name.is_empty())
+            .find_map(|name| self.need(self.named(name)));
+        if need.is_some() {
+            return need;
+        }
+        let equipment = text_of(element, "ActualEquipmentID");
+        let skill = if block.is_empty() { id } else { block };
+        let service = self
+            .named(skill)
+            .split_once(':')
+            .or_else(|| self.named(skill).split_once('/'));
+        let is_plain = |text: &str| !text.is_empty() && !text.contains(';');
+        if let Some((service, procedure)) = service
+            && [equipment, service, procedure].into_iter().all(is_plain)
+            && !procedure.contains(':')
+        {
+            let equipment = escaped(self.named(equipment));
+            return Some(Need {
+                role: Role::Alone(0),
+                capability: None,
+                skill_type: format!(
+                    "nsu=urn:ua-bridge:mtp:{equipment};{service}-{procedure}SkillType"
+                )
+                .parse()
+                .ok(),
+            })
+            .filter(|need| need.skill_type.is_some());
+        }
+        self.error(
+            element,
+            format!(
+                "nothing says which skill does `{id}`; name its capability, as `--name {id}=urn:..`, \
+                 or give it an ActualEquipmentID (the module) and the ID service:procedure"
+            ),
+        );
+        None
+    }
+
+    /// Reads the parameters of a recipe element. `node` is the number that its node gets.
+    fn parameters(
+        &mut self,
+        element: Node<'d, 'd>,
+        node: usize,
+        parts: &mut RecipeParts<'d>,
+    ) -> Vec<Given> {
+        let mut all: Vec<Given> = Vec::new();
+        for parameter in children(element, "Parameter") {
+            let id = text_of(parameter, "ID");
+            if text_of(parameter, "ParameterType") == "ProcessOutput" {
+                self.note(
+                    parameter,
+                    format!("the output `{id}` is left out: skills return their results"),
+                );
+                continue;
+            }
+            let whole = match child(parameter, "Value") {
+                Some(_) => parameter,
+                None => parts.formula.get(id).copied().unwrap_or(parameter),
+            };
+            let formula = (whole != parameter).then_some(whole);
+            for at in [Some(parameter), formula].into_iter().flatten() {
+                self.only(
+                    at,
+                    &[
+                        "ID",
+                        "Description",
+                        "ParameterType",
+                        "ParameterSubType",
+                        "Value",
+                        "Scaled",
+                    ],
+                );
+            }
+            if text_of(whole, "Scaled") == "Yes" {
+                let what =
+                    format!("`{id}` is not scaled: the recipe runs with the size of its formula");
+                self.note(whole, what);
+            }
+            let name = self.named(id).to_owned();
+            let place = all.len();
+            let Some((given, of)) = self.value(whole, &name, parts) else {
+                continue;
+            };
+            if all.iter().any(|known| known.name == name) {
+                self.error(parameter, format!("the parameter `{name}` is given twice"));
+                continue;
+            }
+            let at = whole.range().start;
+            parts.results.extend(of.map(|of| (node, place, of, at)));
+            all.push(given);
+        }
+        all
+    }
+
+    /// Reads the value of a parameter, and the ID of the step whose result it is.
+    fn value(
+        &mut self,
+        parameter: Node<'d, 'd>,
+        name: &str,
+        parts: &RecipeParts<'d>,
+    ) -> Option<(Given, Option<String>)> {
+        let mut parameter = parameter;
+        for _ in 0..MOST_LEVELS {
+            let mut values = children(parameter, "Value");
+            let (Some(value), None) = (values.next(), values.next()) else {
+                self.error(parameter, format!("`{name}` has no value, or several"));
+                return None;
+            };
+            self.only(
+                value,
+                &[
+                    "ValueString",
+                    "DataInterpretation",
+                    "DataType",
+                    "UnitOfMeasure",
+                ],
+            );
+            let texts: Vec<&str> = children(value, "ValueString")
+                .map(|node| node.text().unwrap_or_default().trim())
+                .collect();
+            let text = texts.first().copied().unwrap_or_default();
+            match text_of(value, "DataInterpretation") {
+                "" | "Constant" => {
+                    let read = constant(&texts, text_of(value, "DataType"));
+                    let read = read.or_else(|| {
+                        let kind = text_of(value, "DataType");
+                        self.error(
+                            value,
+                            format!("the value `{text}` of `{name}` is not of the type `{kind}`"),
+                        );
+                        None
+                    })?;
+                    let unit = self.named(text_of(value, "UnitOfMeasure")).to_owned();
+                    if !unit.is_empty() && !units::is_known(&unit) {
+                        self.note(value, format!("the unit `{unit}` of `{name}` is not known"));
+                    }
+                    let unit = (!unit.is_empty()).then_some(unit);
+                    return Some((values::given(name, read, unit), None));
+                }
+                "Reference" => {
+                    if let Some(other) = parts.formula.get(text) {
+                        parameter = *other;
+                        continue;
+                    }
+                    if let Written::Result(step, result) = values::value(&format!("={text}")) {
+                        let mut given = values::given(name, Value::Null, None);
+                        given.result = Some(ResultOf {
+                            step: usize::MAX,
+                            name: result,
+                        });
+                        return Some((given, Some(step)));
+                    }
+                    let what = format!(
+                        "`{name}` refers to `{text}`, which is neither a parameter of the formula nor a result as step.Result"
+                    );
+                    self.error(value, what);
+                    return None;
+                }
+                other => {
+                    let what = format!(
+                        "the DataInterpretation `{other}` of `{name}` is not supported; give a Constant or a Reference"
+                    );
+                    self.error(value, what);
+                    return None;
+                }
+            }
+        }
+        self.error(parameter, format!("the references of `{name}` do not end"));
+        None
+    }
+
+    /// Notes the constraints of equipment, which no plan checks.
+    fn constraints(&mut self, node: Node<'d, 'd>) {
+        for requirement in children(node, "EquipmentRequirement") {
+            self.only(requirement, &["ID", "Description", "Constraint"]);
+            for constraint in children(requirement, "Constraint") {
+                let condition = text_of(constraint, "Condition");
+                self.note(
+                    constraint,
+                    format!("the constraint `{condition}` is not checked"),
+                );
+            }
+        }
+    }
+}
+
+/// Reads a constant of a type; several texts are a list.
+fn constant(texts: &[&str], kind: &str) -> Option<Value> {
+    let one = |text: &str| -> Option<Value> {
+        let kind = kind.rsplit_once(':').map_or(kind, |(_, kind)| kind);
+        match kind.to_ascii_lowercase().as_str() {
+            "boolean" | "bool" => match text {
+                "true" | "True" | "1" => Some(Value::Bool(true)),
+                "false" | "False" | "0" => Some(Value::Bool(false)),
+                _ => None,
+            },
+            "string" | "text" | "identifier" => Some(Value::String(text.to_owned())),
+            "" | "other" => match values::value(text) {
+                Written::Value { value, unit: None } => Some(value),
+                _ => Some(Value::String(text.to_owned())),
+            },
+            _ => {
+                let value: Value = serde_json::from_str(text).ok()?;
+                value.is_number().then_some(value)
+            }
+        }
+    };
+    match texts {
+        [] => None,
+        [text] => one(text),
+        texts => texts.iter().map(|text| one(text)).collect(),
+    }
+}
+
+/// Maximum number of levels of recipe elements.
+const MOST_LEVELS: usize = 16;
