@@ -373,7 +373,7 @@ impl Process {
     }
 }
 
-/// States the alternatives of which one must hold.
+/// Adds the alternatives of a step to the graph.
 fn of_conditions(
     when: &[Vec<Condition>],
     step_iri: &str,

@@ -81,22 +81,7 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
     if by_part.len() > MOST_STEPS {
         return Err(format!("it has more than {MOST_STEPS} steps"));
     }
-    let mut ordered: Vec<(i64, &str, Vec<&Row>)> = Vec::new();
-    for (part, rows) in by_part {
-        let position = one(&rows, "position")?.and_then(Value::as_i64);
-        let position =
-            position.ok_or_else(|| format!("the step {part} has no number as its ua:position"))?;
-        ordered.push((position, part, rows));
-    }
-    ordered.sort_by_key(|(position, ..)| *position);
-    if let Some([(position, one, _), (_, other, _)]) = ordered
-        .windows(2)
-        .find_map(|pair| <&[_; 2]>::try_from(pair).ok().filter(|[a, b]| a.0 == b.0))
-    {
-        return Err(format!(
-            "the steps {one} and {other} have the ua:position {position}"
-        ));
-    }
+    let ordered = in_order(by_part)?;
     let job = job(rows)?;
     let order: Vec<&str> = ordered.iter().map(|(_, part, _)| *part).collect();
     let mut steps = Vec::new();
@@ -147,6 +132,29 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
         within,
         wait,
     })
+}
+
+/// Returns the steps with their rows, in the order of their positions.
+fn in_order<'a>(
+    by_part: BTreeMap<&'a str, Vec<&'a Row>>,
+) -> Result<Vec<(i64, &'a str, Vec<&'a Row>)>, String> {
+    let mut ordered: Vec<(i64, &str, Vec<&Row>)> = Vec::new();
+    for (part, rows) in by_part {
+        let position = one(&rows, "position")?.and_then(Value::as_i64);
+        let position =
+            position.ok_or_else(|| format!("the step {part} has no number as its ua:position"))?;
+        ordered.push((position, part, rows));
+    }
+    ordered.sort_by_key(|(position, ..)| *position);
+    if let Some([(position, one, _), (_, other, _)]) = ordered
+        .windows(2)
+        .find_map(|pair| <&[_; 2]>::try_from(pair).ok().filter(|[a, b]| a.0 == b.0))
+    {
+        return Err(format!(
+            "the steps {one} and {other} have the ua:position {position}"
+        ));
+    }
+    Ok(ordered)
 }
 
 /// Reads the order and the time limit of a step.

@@ -12,7 +12,7 @@ use mtp::escaped;
 use roxmltree::Node;
 use serde_json::Value;
 
-use super::flow::{Flow, NodeCondition, NodeKind};
+use super::flow::{Edge, Flow, NodeCondition, NodeKind};
 use super::values::{self, Written};
 use super::{Reading, child, children, text_of};
 use crate::process::{Given, Job, Need, Process, ResultOf, Role, Step};
@@ -36,6 +36,9 @@ struct RecipeParts<'d> {
 
 /// The first and the last node of a procedure logic.
 type Ends = (usize, usize);
+
+/// The nodes of a procedure logic, by `Step`, `Transition` or `Link` and the ID.
+type Places<'d> = BTreeMap<(&'d str, &'d str), Ends>;
 
 impl<'d> Reading<'d> {
     /// Reads all recipes of a file.
@@ -101,31 +104,7 @@ impl<'d> Reading<'d> {
         parts
             .flow
             .edge(start, first, recipe.range().start, Vec::new());
-        let RecipeParts {
-            mut flow,
-            steps,
-            results,
-            ..
-        } = parts;
-        for (node, parameter, of, at) in results {
-            let Some(step) = steps.get(of.as_str()).copied().flatten() else {
-                self.error_at(
-                    at,
-                    format!(
-                        "the value refers to the step `{of}`, which is unknown or not the only one"
-                    ),
-                );
-                continue;
-            };
-            if let Some(NodeKind::Task(task)) = flow.nodes.get_mut(node).map(|node| &mut node.kind)
-                && let Some(result) = task
-                    .parameters
-                    .get_mut(parameter)
-                    .and_then(|given| given.result.as_mut())
-            {
-                result.step = step;
-            }
-        }
+        let flow = self.resolved(parts);
         let steps = self.steps(&flow)?;
         let description = text_of(recipe, "Description");
         let named = self.named(id);
@@ -148,6 +127,34 @@ impl<'d> Reading<'d> {
         })
     }
 
+    /// Sets the steps whose results are parameters.
+    fn resolved(&mut self, parts: RecipeParts<'d>) -> Flow {
+        let RecipeParts {
+            mut flow,
+            steps,
+            results,
+            ..
+        } = parts;
+        for (node, parameter, of, at) in results {
+            let Some(step) = steps.get(of.as_str()).copied().flatten() else {
+                self.error_at(
+                    at,
+                    format!(
+                        "the value refers to the step `{of}`, which is unknown or not the only one"
+                    ),
+                );
+                continue;
+            };
+            if let Some(NodeKind::Task(task)) = flow.nodes.get_mut(node).map(|node| &mut node.kind)
+                && let Some(given) = task.parameters.get_mut(parameter)
+                && let Some(result) = given.result.as_mut()
+            {
+                result.step = step;
+            }
+        }
+        flow
+    }
+
     /// Adds the steps of a recipe or of a recipe element. `open` has the elements around it.
     fn logic(
         &mut self,
@@ -165,7 +172,61 @@ impl<'d> Reading<'d> {
         self.only(logic, &["Link", "Step", "Transition"]);
         let first = parts.flow.node(at, name, NodeKind::Merge);
         let last = parts.flow.node(at, name, NodeKind::Merge);
-        let mut places: BTreeMap<(&str, &str), Ends> = BTreeMap::new();
+        let (places, conditions) = self.places((parent, logic), parts, open)?;
+        self.links(logic, &places, parts);
+        let mut own: Vec<usize> = places
+            .values()
+            .flat_map(|(one, other)| [*one, *other])
+            .collect();
+        own.sort_unstable();
+        own.dedup();
+        self.transitions(&places, &conditions, parts);
+        let is_inside = |edge: &&Edge| own.contains(&edge.from) && own.contains(&edge.to);
+        let inside: Vec<(usize, usize)> = parts
+            .flow
+            .edges
+            .iter()
+            .filter(is_inside)
+            .map(|edge| (edge.from, edge.to))
+            .collect();
+        // A step to which no link leads would begin at once: only one step does.
+        let starts = places.values().map(|ends| ends.0);
+        let starts: Vec<usize> = starts
+            .filter(|start| !inside.iter().any(|(_, to)| to == start))
+            .collect();
+        if starts.len() > 1 {
+            let names = starts.iter().filter_map(|node| parts.flow.nodes.get(*node));
+            let names: Vec<&str> = names.map(|node| node.name.as_str()).collect();
+            let what = format!(
+                "no link leads to {}; only one step can be the first",
+                names.join(", ")
+            );
+            self.error(logic, what);
+        }
+        for start in starts {
+            parts.flow.edge(first, start, at, Vec::new());
+        }
+        let lasts = places.values().map(|ends| ends.1);
+        let lasts: Vec<usize> = lasts
+            .filter(|end| !inside.iter().any(|(from, _)| from == end))
+            .collect();
+        for end in lasts {
+            parts.flow.edge(end, last, at, Vec::new());
+        }
+        if places.is_empty() {
+            parts.flow.edge(first, last, at, Vec::new());
+        }
+        Some((first, last))
+    }
+
+    /// Adds the nodes of the steps, transitions and links of a procedure logic.
+    fn places(
+        &mut self,
+        (parent, logic): (Node<'d, 'd>, Node<'d, 'd>),
+        parts: &mut RecipeParts<'d>,
+        open: &mut Vec<Node<'d, 'd>>,
+    ) -> Option<(Places<'d>, BTreeMap<usize, Node<'d, 'd>>)> {
+        let mut places: Places<'d> = BTreeMap::new();
         let mut conditions: BTreeMap<usize, Node<'d, 'd>> = BTreeMap::new();
         for step in children(logic, "Step") {
             self.only(
@@ -216,6 +277,11 @@ impl<'d> Reading<'d> {
             let node = parts.flow.node(link.range().start, id, kind);
             places.insert(("Link", id), (node, node));
         }
+        Some((places, conditions))
+    }
+
+    /// Adds the flows between the nodes of a procedure logic.
+    fn links(&mut self, logic: Node<'d, 'd>, places: &Places<'d>, parts: &mut RecipeParts<'d>) {
         for link in children(logic, "Link") {
             self.only(
                 link,
@@ -253,56 +319,13 @@ impl<'d> Reading<'d> {
                 }
             }
         }
-        let mut own: Vec<usize> = places
-            .values()
-            .flat_map(|(one, other)| [*one, *other])
-            .collect();
-        own.sort_unstable();
-        own.dedup();
-        self.transitions(&places, &conditions, parts);
-        // A step to which no link leads would begin at once: only one step does.
-        let is_first = |ends: &&Ends| {
-            let mut edges = parts.flow.edges.iter();
-            !edges.any(|edge| edge.to == ends.0 && own.contains(&edge.from))
-        };
-        let starts: Vec<usize> = places
-            .values()
-            .filter(is_first)
-            .map(|ends| ends.0)
-            .collect();
-        if starts.len() > 1 {
-            let names = starts.iter().filter_map(|node| parts.flow.nodes.get(*node));
-            let names: Vec<&str> = names.map(|node| node.name.as_str()).collect();
-            let what = format!(
-                "no link leads to {}; only one step can be the first",
-                names.join(", ")
-            );
-            self.error(logic, what);
-        }
-        for start in starts {
-            parts.flow.edge(first, start, at, Vec::new());
-        }
-        // The steps without anything behind them are the last ones.
-        let is_left = |ends: &&Ends| {
-            let mut edges = parts.flow.edges.iter();
-            !edges.any(|edge| edge.from == ends.1 && own.contains(&edge.to))
-        };
-        let left: Vec<usize> = places.values().filter(is_left).map(|ends| ends.1).collect();
-        // Several ends that run in parallel are awaited together at the last node.
-        for end in left {
-            parts.flow.edge(end, last, at, Vec::new());
-        }
-        if places.is_empty() {
-            parts.flow.edge(first, last, at, Vec::new());
-        }
-        Some((first, last))
     }
 
     /// Sets the conditions of the flows behind transitions. Of several transitions behind a step
     /// the first whose condition holds is taken.
     fn transitions(
         &mut self,
-        places: &BTreeMap<(&'d str, &'d str), Ends>,
+        places: &Places<'d>,
         conditions: &BTreeMap<usize, Node<'d, 'd>>,
         parts: &mut RecipeParts<'d>,
     ) {
@@ -467,6 +490,17 @@ impl<'d> Reading<'d> {
             }
             _ => {}
         }
+        self.phase((step, element), block_id, parts)
+    }
+
+    /// Adds a recipe element without a procedure logic: a step of the process.
+    fn phase(
+        &mut self,
+        (step, element): (Node<'d, 'd>, Node<'d, 'd>),
+        block_id: &'d str,
+        parts: &mut RecipeParts<'d>,
+    ) -> Option<Ends> {
+        let (id, at) = (text_of(step, "ID"), step.range().start);
         let need = self.need_of(element, block_id)?;
         let node = parts.flow.nodes.len();
         let parameters = self.parameters(element, node, parts);

@@ -234,6 +234,23 @@ impl<'d> Reading<'d> {
             );
             return None;
         };
+        let given = self.parameters((task, name), node, parts);
+        self.left_out(task);
+        Some(Step {
+            name: name.to_owned(),
+            needs: vec![need],
+            parameters: given,
+            ..Step::default()
+        })
+    }
+
+    /// Reads the parameters of a task.
+    fn parameters(
+        &mut self,
+        (task, name): (Node<'d, 'd>, &str),
+        node: usize,
+        parts: &mut Parts<'d>,
+    ) -> Vec<Given> {
         let mut given: Vec<Given> = Vec::new();
         for (key, text, at) in inputs(task) {
             let key = self.named(key).to_owned();
@@ -260,13 +277,7 @@ impl<'d> Reading<'d> {
                 }
             }
         }
-        self.left_out(task);
-        Some(Step {
-            name: name.to_owned(),
-            needs: vec![need],
-            parameters: given,
-            ..Step::default()
-        })
+        given
     }
 
     /// Notes the extensions of a task that are not read.
@@ -409,39 +420,49 @@ impl<'d> Reading<'d> {
             let default = parts.exclusive.get(id).copied();
             // The default flow is taken when no other is.
             branches.sort_by_key(|flow| flow.attribute("id").is_some_and(|id| Some(id) == default));
-            let mut own: Vec<Vec<NodeCondition>> = Vec::new();
-            let count = branches.len();
-            for (number, flow) in branches.iter().enumerate() {
-                let condition = child(*flow, "conditionExpression");
-                let is_last = number + 1 == count;
-                let read = condition.map(|condition| self.expression(condition, parts));
-                match (&read, default) {
-                    (None, None) => {}
-                    (Some(_), None) => self.error(
-                        *flow,
-                        format!("the flow behind `{id}` has a condition; put an exclusive gateway there"),
-                    ),
-                    (Some(_), Some(_)) if count == 1 || is_last => self.error(
-                        *flow,
-                        format!("the exclusive gateway `{id}` has no default flow: nothing happens if no condition holds"),
-                    ),
-                    (None, Some(_)) if !is_last => self.error(
-                        *flow,
-                        format!("a flow behind the exclusive gateway `{id}` has no condition, and is not its default flow"),
-                    ),
-                    (_, Some(_)) => {}
-                }
-                own.push(read.flatten().into_iter().collect());
-            }
-            let whens = match default {
-                Some(_) => Flow::exclusive(own),
-                None => own,
-            };
+            let whens = self.branches(id, (&branches, default), parts);
             for (flow, own) in branches.into_iter().zip(whens) {
                 let mut when = flow::ended_well(from, &handled);
                 when.extend(own);
                 self.flow((from, flow), when, parts);
             }
+        }
+    }
+
+    /// Returns the conditions of the flows behind an element, of which the last is the default flow
+    /// of an exclusive gateway.
+    fn branches(
+        &mut self,
+        id: &str,
+        (branches, default): (&[Node<'d, 'd>], Option<&'d str>),
+        parts: &Parts<'d>,
+    ) -> Vec<Vec<NodeCondition>> {
+        let mut own: Vec<Vec<NodeCondition>> = Vec::new();
+        for (flow, left) in branches.iter().zip((0..branches.len()).rev()) {
+            let condition = child(*flow, "conditionExpression");
+            let read = condition.map(|condition| self.expression(condition, parts));
+            let what = match (&read, default) {
+                (Some(_), None) => Some(format!(
+                    "the flow behind `{id}` has a condition; put an exclusive gateway there"
+                )),
+                (Some(_), Some(_)) if left == 0 => Some(format!(
+                    "the exclusive gateway `{id}` has no default flow: nothing happens if no \
+                     condition holds"
+                )),
+                (None, Some(_)) if left > 0 => Some(format!(
+                    "a flow behind the exclusive gateway `{id}` has no condition, and is not its \
+                     default flow"
+                )),
+                (_, Some(_)) | (None, None) => None,
+            };
+            if let Some(what) = what {
+                self.error(*flow, what);
+            }
+            own.push(read.flatten().into_iter().collect());
+        }
+        match default {
+            Some(_) => Flow::exclusive(own),
+            None => own,
         }
     }
 

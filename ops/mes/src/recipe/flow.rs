@@ -70,8 +70,8 @@ impl Flow {
         self.edges.push(Edge { from, to, at, when });
     }
 
-    /// Makes one flow of several exclusive ones behind a node: each holds if its own conditions hold
-    /// and those of the earlier ones do not. Each has one condition, and the last one has none.
+    /// Makes branches exclusive: a branch is taken if its own condition holds and the conditions of
+    /// the branches before it do not hold. The last branch has no condition of its own.
     pub(super) fn exclusive(branches: Vec<Vec<NodeCondition>>) -> Vec<Vec<NodeCondition>> {
         let mut before: Vec<NodeCondition> = Vec::new();
         let mut all = Vec::new();
@@ -330,7 +330,7 @@ pub(super) fn handled(flow: &Flow, node: usize) -> Vec<BadEnd> {
     let conditions = flow.edges.iter().flat_map(|edge| &edge.when);
     let ends = conditions.filter_map(|condition| match condition.test {
         Test::Ended(end) if condition.step == node && !condition.is_negated => Some(end),
-        _ => None,
+        Test::Ended(_) | Test::Result { .. } => None,
     });
     let ends: BTreeSet<BadEnd> = ends.collect();
     ends.into_iter().collect()
@@ -379,8 +379,8 @@ fn implies(guard: &Guard, other: &Guard) -> bool {
     })
 }
 
-/// Joins alternatives that differ in one condition and its negation, and removes those that contain
-/// another.
+/// Joins pairs of alternatives that differ only in a condition and its negation, and removes
+/// alternatives that contain another alternative.
 fn simplified(mut guard: Guard) -> Guard {
     while let Some((one, other, shorter)) = joined(&guard) {
         guard.remove(other.max(one));
@@ -402,7 +402,7 @@ fn simplified(mut guard: Guard) -> Guard {
     guard
 }
 
-/// Returns two alternatives that can be one, and that one.
+/// Returns the places of two alternatives that can be joined, and the joined alternative.
 fn joined(guard: &Guard) -> Option<(usize, usize, Vec<NodeCondition>)> {
     for (one, first) in guard.iter().enumerate() {
         for (other, second) in guard.iter().enumerate().skip(one + 1) {

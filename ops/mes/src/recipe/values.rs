@@ -72,7 +72,7 @@ fn reference(text: &str) -> Option<(&str, &str)> {
 /// Reads a comparison as `step.Result >= 5`. `node` returns the node with the ID of a step.
 ///
 /// # Errors
-/// The reason why it is none.
+/// The text is no comparison, or its step is unknown.
 pub(super) fn condition(
     text: &str,
     node: &dyn Fn(&str) -> Option<usize>,
