@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
-use system_tests::{Cell, Child, Started, eventually, http_get, program};
+use system_tests::{Cell, Child, Peer, Started, eventually, http_get, program};
 
 const SOON: Duration = Duration::from_secs(30);
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/plant");
@@ -536,4 +536,91 @@ fn a_kill_in_the_middle_of_updates_loses_no_acknowledged_one() {
         });
         assert!(acknowledged >= 100 * kills);
     }
+}
+
+/// Starts the three modules of the example recipe, simulated, and their services as skills.
+fn modules(cell: &Cell) -> Vec<Child> {
+    let mut started = Vec::new();
+    for (module, port) in [("dosing", 4855), ("mixing", 4856), ("reacting", 4857)] {
+        let file = format!("{module}.aml");
+        let manifest = cell.folder().join(&file);
+        fs::copy(Path::new(EXAMPLES).join(&file), &manifest).unwrap();
+        let listen = format!("opc.tcp://127.0.0.1:{port}");
+        let pea = Started::new(module, &program("ua-space"))
+            .args(["pea", manifest.to_str().unwrap(), "--listen", &listen])
+            .args(["--acting", "0.05", "--executing", "0.5"])
+            .start();
+        started.push(pea);
+        let yaml = format!("{module}.yaml");
+        started.push(start(cell, "ua-component", &yaml, &[], &[]));
+    }
+    started
+}
+
+#[test]
+fn a_recipe_of_batchml_runs_as_a_job_order_of_an_opcua_client() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let recipe = Path::new(EXAMPLES).join("batch.xml");
+    fs::copy(recipe, cell.folder().join("batch.xml")).unwrap();
+    let text = "mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\n\
+                endpoint: opc.tcp://127.0.0.1:48401\nsecurity: [None]\nrecipes: [batch.xml]\n";
+    let path = cell.file("mes.yaml", text);
+    let _mes = Started::new("mes", &program("ua-mes"))
+        .args([path.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
+        .start();
+    let _modules = modules(&cell);
+    let process = "urn:ua-bridge:recipe:StirredAndReacted";
+    eventually("each step has a skill", SOON, || {
+        let plan = get(&format!("/plan/{process}"))?;
+        (plan["complete"] == true).then_some(())
+    });
+    let said = cell.asyncua_once("opcua_jobs.py", &["opc.tcp://127.0.0.1:48401", process]);
+    let calls: Vec<(&str, u64)> = said
+        .iter()
+        .filter_map(|line| Some((line["call"].as_str()?, line["status"].as_u64()?)))
+        .collect();
+    let expected = [
+        ("Store", 1),
+        ("Store", 16),
+        ("Stop", 8),
+        ("Start", 1),
+        ("Clear", 8),
+        ("StoreAndStart", 1),
+        ("Stop", 1),
+        ("Clear", 1),
+    ];
+    assert_eq!(calls, expected, "{said:?}");
+    let response = said.last().unwrap();
+    assert_eq!(
+        response["state"], 5,
+        "the first job order has ended: {response}"
+    );
+    let runs = get("/status").unwrap()["runs"].clone();
+    let outcomes: Vec<_> = list(&serde_json::json!({ "runs": runs }), "runs")
+        .iter()
+        .map(|run| run["outcome"].as_str().unwrap_or_default().to_owned())
+        .collect();
+    assert_eq!(
+        outcomes.first().map(String::as_str),
+        Some("done"),
+        "{outcomes:?}"
+    );
+    // The reactor is heated while the liquid is dosed and stirred.
+    let ran = list(&runs[0]["plans"][0], "ran");
+    let steps: Vec<_> = ran.iter().filter_map(|ran| ran["step"].as_str()).collect();
+    assert_eq!(steps.len(), 4, "{ran:?}");
+    let of = |step: &str, key: &str| {
+        let ran = ran.iter().find(|ran| ran["step"] == step).unwrap();
+        ran[key].as_u64().unwrap()
+    };
+    assert!(
+        of("heat the reactor", "started_ms") < of("dose", "ended_ms"),
+        "{ran:?}"
+    );
+    assert!(
+        of("cool the reactor", "started_ms") >= of("stir", "ended_ms"),
+        "{ran:?}"
+    );
 }

@@ -163,6 +163,7 @@ impl UaComponent {
             configuration: Some(self.pki_root(component).join("configuration.json")),
             source: Some((text.clone(), self.file().display().to_string())),
             file: Some(Arc::clone(file)),
+            extension: None,
         }
     }
 }

@@ -59,6 +59,8 @@ pub struct Options {
     pub source: Option<(String, String)>,
     /// The YAML file, which is read again while the component runs.
     pub file: Option<Arc<ComponentFile>>,
+    /// Additional objects of the component in its OPC UA server.
+    pub extension: Option<Arc<dyn skills::server::Extension>>,
 }
 
 /// Returns the mapping of a component, which has a single namespace and no variables.
@@ -123,6 +125,7 @@ impl ComponentPort {
             supervision: Supervision::default(),
             power_off: component.power_off.then(power_off),
             configuration: options.configuration.clone(),
+            extension: options.extension.clone(),
         };
         let mut reporters = Vec::new();
         let (mut asking, mut topics) = (Asking::new(), Topics::default());

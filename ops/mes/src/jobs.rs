@@ -11,6 +11,7 @@ use tokio::sync::watch;
 
 use crate::cell::{Cell, now};
 use crate::execute::{Plant, execute};
+use crate::job_orders::{JobOutcome, JobProgress, JobRuns};
 use crate::record::{How, Run};
 
 /// The jobs.
@@ -126,6 +127,49 @@ impl knowledge::Jobs for Jobs {
             }
         }
         serde_json::json!({ "jobs": jobs })
+    }
+}
+
+impl JobRuns for Jobs {
+    fn is_process(&self, process: &str) -> bool {
+        let known = self.cell.processes();
+        known.all.iter().any(|known| known.iri == process)
+    }
+
+    fn start(&self, process: &str) -> Result<Option<u64>, String> {
+        knowledge::Jobs::start(self, process)
+    }
+
+    fn stop(&self, job: u64) {
+        knowledge::Jobs::stop(self, job);
+    }
+
+    fn progress(&self, job: u64) -> Option<JobProgress> {
+        let known = locked(&self.all).get(&job).cloned()?;
+        let mut runs = self.cell.runs().into_iter();
+        let run = runs.find(|run| run.number() == Some(job));
+        let ran = run
+            .iter()
+            .flat_map(|run| &run.plans)
+            .flat_map(|plan| &plan.ran);
+        let results = ran.flat_map(|ran| {
+            let one = |(name, value): (&String, &serde_json::Value)| {
+                (format!("{}.{name}", ran.step), value.clone())
+            };
+            ran.results.iter().map(one)
+        });
+        Some(JobProgress {
+            outcome: match known.outcome {
+                How::Running => JobOutcome::Running,
+                How::Done => JobOutcome::Done,
+                How::Failed | How::Stopped => JobOutcome::Failed,
+                How::Lost | How::Unknown => JobOutcome::Unknown,
+            },
+            reason: known.reason,
+            started_ms: known.started_ms,
+            ended_ms: known.ended_ms,
+            results: results.collect(),
+        })
     }
 }
 

@@ -14,6 +14,7 @@
 //! - `sources`: from files to the graph, while the program runs
 //! - `goal`: the search for a sequence that reaches a goal
 //! - `jobs`: processes that clients start, several at a time
+//! - `job_orders`, `job_control`: jobs for clients of OPC 10031-4
 //! - `execution_skill` and `locate_skill`: the skills of the MES
 
 mod cell;
@@ -21,6 +22,8 @@ mod execute;
 mod execution_skill;
 mod follow;
 mod goal;
+mod job_control;
+mod job_orders;
 mod jobs;
 mod live;
 mod locate_skill;
@@ -58,6 +61,7 @@ use ua_component::{ComponentPort, Options, made};
 
 use crate::cell::Cell;
 use crate::execution_skill::ExecuteProcess;
+use crate::job_control::JobControl;
 use crate::jobs::Jobs;
 use crate::locate_skill::LocateObject;
 use crate::settings::{Connect, Settings};
@@ -204,7 +208,7 @@ impl UaMes {
     }
 
     /// Returns the handlers of changes over HTTP.
-    fn writes(&self, ready: &Ready) -> Result<Writes, Failure> {
+    fn writes(&self, ready: &Ready, jobs: Arc<Jobs>) -> Result<Writes, Failure> {
         let settings = &ready.settings;
         let folder = self.pki_root(settings).join(users::FOLDER);
         let access = Access::new(Some(folder), settings.sparql.ip().is_loopback());
@@ -220,7 +224,7 @@ impl UaMes {
             may: has(&access, Role::Engineer),
             may_run: has(&access, Role::Operator),
             files: Arc::clone(ready.cell.sources()) as Arc<dyn SourceFiles>,
-            jobs: Arc::new(Jobs::new(Arc::clone(&ready.cell), Handle::current())),
+            jobs,
         })
     }
 
@@ -305,6 +309,7 @@ impl UaMes {
             configuration: None,
             source: None,
             file: None,
+            extension: None,
         }
     }
 
@@ -317,7 +322,7 @@ impl UaMes {
     }
 
     /// Serves queries, and follows the components of the plant.
-    async fn serve(&self, ready: &Ready) -> Result<(), Failure> {
+    async fn serve(&self, ready: &Ready, jobs: Arc<Jobs>) -> Result<(), Failure> {
         let page = page(&ready.cell);
         let address = ready.settings.sparql;
         let endpoint = Endpoint::bind_with(
@@ -325,7 +330,7 @@ impl UaMes {
             Arc::clone(&ready.knowledge),
             Limits::default(),
             page,
-            Some(self.writes(ready)?),
+            Some(self.writes(ready, jobs)?),
         )
         .await;
         let endpoint = endpoint.map_err(|error| {
@@ -432,10 +437,13 @@ impl Program for UaMes {
 
     async fn start(&self, _context: Context) -> Result<ComponentPort, Failure> {
         let ready = self.ready()?;
-        self.serve(ready).await?;
+        let jobs = Arc::new(Jobs::new(Arc::clone(&ready.cell), Handle::current()));
+        self.serve(ready, Arc::clone(&jobs)).await?;
+        let control = JobControl::new(jobs, Handle::current());
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
         let options = Options {
+            extension: Some(Arc::new(control)),
             gds,
             ..ready.options.clone()
         };

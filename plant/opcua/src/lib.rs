@@ -6,7 +6,7 @@
 //! `certificates`, `known`, `judge` and `door` (access), `nodeset` (types from files), `users`,
 //! `supervision`, `audit` and `changes`, `server` and `client`, `file`, `trust_file`, `directory`
 //! and `configuration` (certificate management by clients), `enrolment` (certificates of a Global
-//! Discovery Server).
+//! Discovery Server), `job_control` (structures of job orders).
 
 #[cfg(feature = "server")]
 pub mod audit;
@@ -27,6 +27,8 @@ pub mod enrolment;
 mod event;
 #[cfg(feature = "server")]
 pub mod file;
+#[cfg(feature = "server")]
+pub mod job_control;
 pub mod judge;
 pub mod known;
 pub mod limits;

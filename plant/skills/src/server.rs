@@ -85,6 +85,26 @@ pub struct ServeSettings {
     /// The file with the configuration of the component; `None` for a configuration that is lost
     /// at the end of the program.
     pub configuration: Option<PathBuf>,
+    /// Additional objects of the component.
+    pub extension: Option<Arc<dyn Extension>>,
+}
+
+/// Adds objects to the object of a component.
+pub trait Extension: std::fmt::Debug + Send + Sync {
+    /// Adds NodeSets and type loaders to the server.
+    fn prepare(&self, builder: ServerBuilder) -> ServerBuilder;
+
+    /// Creates the objects below the object of the component.
+    ///
+    /// # Errors
+    /// A node cannot be created.
+    fn serve(
+        &self,
+        server: &Server,
+        component: &NodeId,
+        ids: &mut IdRange,
+        users: &Arc<Access>,
+    ) -> Result<(), InstanceError>;
 }
 
 /// The reason why a component cannot be served.
@@ -133,6 +153,7 @@ impl ComponentServer {
         mut observers: impl FnMut(u16, &Facts) -> Vec<Box<dyn Observer>>,
     ) -> Result<Self, ServeFault> {
         let users = users_of(component, settings)?;
+        let all_users = Arc::clone(&users);
         let server = server_of(component, settings, &users)?;
         let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
         let root = root(&server, component, &mut ids)?;
@@ -197,6 +218,9 @@ impl ComponentServer {
         tasks.spawn(shown);
         let values = (values, &configuration);
         let values = values::serve(&server, &root.node_id, &mut ids, values, &mut tasks)?;
+        if let Some(extension) = &settings.extension {
+            extension.serve(&server, &root.node_id, &mut ids, &all_users)?;
+        }
         if let Some(node) = root.node("LeaseHolder") {
             let node = node.clone();
             tasks.spawn(show_holder(server.clone(), node, authority.holder()));
@@ -327,6 +351,9 @@ fn server_of(
     }
     for (namespace, text) in component.device.iter().flat_map(|device| device.nodesets()) {
         builder = builder.nodeset_str(&namespace, &text);
+    }
+    if let Some(extension) = &settings.extension {
+        builder = extension.prepare(builder);
     }
     Ok(builder.build()?)
 }

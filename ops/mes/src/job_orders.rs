@@ -1,0 +1,481 @@
+//! Job orders (OPC 10031-4): their states, and the commands of clients. A job order names a process;
+//! its run is a job of the MES.
+
+use plant_opcua::job_control::JobOrder;
+use serde_json::Value as Json;
+
+/// The states of a job order, with their numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum OrderState {
+    NotAllowedToStart = 1,
+    AllowedToStart = 2,
+    Running = 3,
+    /// The outcome of the run is unknown: its machines may move.
+    Interrupted = 4,
+    Ended = 5,
+    Aborted = 6,
+}
+
+impl OrderState {
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::NotAllowedToStart => "NotAllowedToStart",
+            Self::AllowedToStart => "AllowedToStart",
+            Self::Running => "Running",
+            Self::Interrupted => "Interrupted",
+            Self::Ended => "Ended",
+            Self::Aborted => "Aborted",
+        }
+    }
+
+    pub(crate) const fn number(self) -> u32 {
+        self as u32
+    }
+}
+
+/// The status that a command returns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Status {
+    Good,
+    UnknownOrder,
+    /// The command does not fit the state.
+    InvalidState,
+    /// The job order needs something that the MES does not have.
+    UnableToAccept,
+    InvalidRequest,
+}
+
+impl Status {
+    /// Returns the bit field of OPC 10031-4.
+    pub(crate) const fn bits(self) -> u64 {
+        match self {
+            Self::Good => 1,
+            Self::UnknownOrder => 1 << 1,
+            Self::InvalidState => 1 << 3,
+            Self::UnableToAccept => 1 << 4,
+            Self::InvalidRequest => 1 << 32,
+        }
+    }
+}
+
+/// The jobs of the MES.
+pub(crate) trait JobRuns: Send + Sync {
+    /// Returns whether there is such a process.
+    fn is_process(&self, process: &str) -> bool;
+
+    /// Starts a process. Returns the number of its job; `None` if too many jobs are running.
+    ///
+    /// # Errors
+    /// The reason why it cannot run.
+    fn start(&self, process: &str) -> Result<Option<u64>, String>;
+
+    /// Stops a job, or gives back the components of a job with an unknown outcome.
+    fn stop(&self, job: u64);
+
+    /// Returns the progress of a job.
+    fn progress(&self, job: u64) -> Option<JobProgress>;
+}
+
+/// The progress of a job. Times are in ms since 1970.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct JobProgress {
+    pub(crate) outcome: JobOutcome,
+    pub(crate) reason: Option<String>,
+    pub(crate) started_ms: u64,
+    pub(crate) ended_ms: Option<u64>,
+    /// The results of the steps, by `step.Result`.
+    pub(crate) results: Vec<(String, Json)>,
+}
+
+/// The outcome of a job.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum JobOutcome {
+    Running,
+    Done,
+    /// Its end is confirmed.
+    Failed,
+    Unknown,
+}
+
+/// A job order.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Order {
+    pub(crate) order: JobOrder,
+    pub(crate) state: OrderState,
+    pub(crate) progress: Option<JobProgress>,
+    /// The reason of the last change of the state, if there is one.
+    pub(crate) reason: Option<String>,
+    process: String,
+    job: Option<u64>,
+    /// The state that a client wants the run to end in.
+    wanted: Option<OrderState>,
+}
+
+impl Order {
+    fn id(&self) -> &str {
+        self.order.id.as_ref()
+    }
+}
+
+/// The job orders of the MES.
+#[derive(Debug, Default)]
+pub(crate) struct Orders {
+    all: Vec<Order>,
+}
+
+/// A command for a job order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Command {
+    Start,
+    RevokeStart,
+    Pause,
+    Resume,
+    Stop,
+    Abort,
+    Cancel,
+    Clear,
+}
+
+impl Orders {
+    pub(crate) fn all(&self) -> &[Order] {
+        &self.all
+    }
+
+    /// Returns the job order with an ID.
+    pub(crate) fn order(&self, id: &str) -> Option<&Order> {
+        self.all.iter().find(|order| order.id() == id)
+    }
+
+    /// Stores a job order.
+    pub(crate) fn store(&mut self, order: JobOrder, runs: &dyn JobRuns) -> Status {
+        let process = match process_of(&order, runs) {
+            Ok(process) => process,
+            Err(status) => return status,
+        };
+        if self.order(order.id.as_ref()).is_some() || self.all.len() >= MOST_ORDERS {
+            return Status::UnableToAccept;
+        }
+        self.all.push(Order {
+            order,
+            state: OrderState::NotAllowedToStart,
+            progress: None,
+            reason: None,
+            process,
+            job: None,
+            wanted: None,
+        });
+        Status::Good
+    }
+
+    /// Replaces a job order that has not been started.
+    pub(crate) fn update(&mut self, order: JobOrder, runs: &dyn JobRuns) -> Status {
+        let mut all = self.all.iter_mut();
+        let Some(known) = all.find(|known| known.order.id == order.id) else {
+            return Status::UnknownOrder;
+        };
+        if known.job.is_some() || known.state.number() > OrderState::AllowedToStart.number() {
+            return Status::InvalidState;
+        }
+        match process_of(&order, runs) {
+            Ok(process) => {
+                known.process = process;
+                known.order = order;
+                Status::Good
+            }
+            Err(status) => status,
+        }
+    }
+
+    /// Executes a command.
+    pub(crate) fn command(&mut self, id: &str, command: Command, runs: &dyn JobRuns) -> Status {
+        use OrderState::{Aborted, AllowedToStart, Ended, Interrupted, NotAllowedToStart, Running};
+        let Some(place) = self.all.iter().position(|order| order.id() == id) else {
+            return Status::UnknownOrder;
+        };
+        let Some(order) = self.all.get_mut(place) else {
+            return Status::UnknownOrder;
+        };
+        match (command, order.state) {
+            (Command::Start, NotAllowedToStart) => order.state = AllowedToStart,
+            (Command::RevokeStart, AllowedToStart) => order.state = NotAllowedToStart,
+            (Command::Cancel, NotAllowedToStart | AllowedToStart)
+            | (Command::Clear, Ended | Aborted) => drop(self.all.remove(place)),
+            (Command::Abort, NotAllowedToStart | AllowedToStart) => order.state = Aborted,
+            (Command::Stop | Command::Abort, Running) => {
+                let end = if command == Command::Stop {
+                    Ended
+                } else {
+                    Aborted
+                };
+                order.wanted = Some(end);
+                order.job.into_iter().for_each(|job| runs.stop(job));
+            }
+            // Someone has looked at the machines.
+            (Command::Stop | Command::Abort, Interrupted) => {
+                order.job.take().into_iter().for_each(|job| runs.stop(job));
+                order.state = if command == Command::Stop {
+                    Ended
+                } else {
+                    Aborted
+                };
+            }
+            // A run cannot be paused between its steps.
+            (Command::Pause | Command::Resume, Running | Interrupted) => {
+                return Status::UnableToAccept;
+            }
+            _ => return Status::InvalidState,
+        }
+        self.poll(runs);
+        Status::Good
+    }
+
+    /// Starts the job orders that are allowed to start, and follows the runs. Returns whether an
+    /// order has changed.
+    pub(crate) fn poll(&mut self, runs: &dyn JobRuns) -> bool {
+        let mut has_changed = false;
+        for order in &mut self.all {
+            if order.state == OrderState::AllowedToStart {
+                match runs.start(&order.process) {
+                    Ok(None) => continue,
+                    Ok(Some(job)) => {
+                        order.job = Some(job);
+                        order.state = OrderState::Running;
+                    }
+                    Err(why) => {
+                        order.state = OrderState::Aborted;
+                        order.reason = Some(why);
+                    }
+                }
+                has_changed = true;
+            }
+            let Some(job) = order.job.filter(|_| order.state == OrderState::Running) else {
+                continue;
+            };
+            let Some(progress) = runs.progress(job) else {
+                // A job is removed from the list after its end, which was not seen.
+                order.state = OrderState::Interrupted;
+                order.reason = Some("the outcome of the job is unknown".to_owned());
+                has_changed = true;
+                continue;
+            };
+            let wanted = order.wanted.unwrap_or(OrderState::Aborted);
+            let state = match progress.outcome {
+                JobOutcome::Running => OrderState::Running,
+                JobOutcome::Done => OrderState::Ended,
+                JobOutcome::Failed => wanted,
+                JobOutcome::Unknown => OrderState::Interrupted,
+            };
+            has_changed |= state != order.state;
+            order.state = state;
+            order.reason.clone_from(&progress.reason);
+            order.progress = Some(progress);
+        }
+        has_changed
+    }
+}
+
+/// Returns the process of a job order.
+fn process_of(order: &JobOrder, runs: &dyn JobRuns) -> Result<String, Status> {
+    let id = order.id.as_ref();
+    if id.is_empty() || id.len() > LONGEST_ID {
+        return Err(Status::InvalidRequest);
+    }
+    // Nothing that a client requires is left out without a word.
+    let is_empty = |count: Option<usize>| count.unwrap_or_default() == 0;
+    let counts = [
+        order.parameters.as_ref().map(Vec::len),
+        order.personnel.as_ref().map(Vec::len),
+        order.equipment.as_ref().map(Vec::len),
+        order.assets.as_ref().map(Vec::len),
+        order.material.as_ref().map(Vec::len),
+    ];
+    if !counts.into_iter().all(is_empty) || order.start.is_some() {
+        return Err(Status::UnableToAccept);
+    }
+    let masters = order.work_masters.iter().flatten();
+    let mut known = masters.filter(|master| {
+        let parameters = master.parameters.as_ref().map_or(0, Vec::len);
+        parameters == 0 && runs.is_process(master.id.as_ref())
+    });
+    let process = known.next().map(|master| master.id.as_ref().to_owned());
+    process.ok_or(Status::UnableToAccept)
+}
+
+/// Maximum number of job orders.
+pub(crate) const MOST_ORDERS: usize = 100;
+const LONGEST_ID: usize = 256;
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use plant_opcua::job_control::{Parameter, WorkMaster};
+
+    use super::*;
+
+    /// Jobs whose outcomes the test sets.
+    #[derive(Default)]
+    struct Fakes {
+        outcome: Mutex<Option<JobOutcome>>,
+        is_busy: Mutex<bool>,
+        calls: Mutex<Vec<String>>,
+    }
+
+    impl JobRuns for Fakes {
+        fn is_process(&self, process: &str) -> bool {
+            process == "urn:p"
+        }
+
+        fn start(&self, process: &str) -> Result<Option<u64>, String> {
+            if *self.is_busy.lock().unwrap() {
+                return Ok(None);
+            }
+            self.calls.lock().unwrap().push(format!("start {process}"));
+            *self.outcome.lock().unwrap() = Some(JobOutcome::Running);
+            Ok(Some(7))
+        }
+
+        fn stop(&self, job: u64) {
+            self.calls.lock().unwrap().push(format!("stop {job}"));
+        }
+
+        fn progress(&self, _job: u64) -> Option<JobProgress> {
+            Some(JobProgress {
+                outcome: (*self.outcome.lock().unwrap())?,
+                reason: None,
+                started_ms: 1,
+                ended_ms: None,
+                results: Vec::new(),
+            })
+        }
+    }
+
+    fn job_order(id: &str, process: &str) -> JobOrder {
+        let master = WorkMaster {
+            id: process.into(),
+            ..WorkMaster::default()
+        };
+        JobOrder {
+            id: id.into(),
+            work_masters: Some(vec![master]),
+            ..JobOrder::default()
+        }
+    }
+
+    fn state(orders: &Orders) -> OrderState {
+        orders.order("one").unwrap().state
+    }
+
+    #[test]
+    fn commands_follow_the_states() {
+        let runs = Fakes::default();
+        let mut orders = Orders::default();
+        assert_eq!(orders.store(job_order("one", "urn:p"), &runs), Status::Good);
+        assert_eq!(
+            orders.store(job_order("one", "urn:p"), &runs),
+            Status::UnableToAccept
+        );
+        assert_eq!(
+            orders.store(job_order("two", "urn:q"), &runs),
+            Status::UnableToAccept
+        );
+        assert_eq!(
+            orders.store(job_order("", "urn:p"), &runs),
+            Status::InvalidRequest
+        );
+        assert_eq!(
+            orders.command("two", Command::Start, &runs),
+            Status::UnknownOrder
+        );
+        for command in [
+            Command::Stop,
+            Command::Clear,
+            Command::RevokeStart,
+            Command::Pause,
+        ] {
+            assert_eq!(orders.command("one", command, &runs), Status::InvalidState);
+        }
+        assert_eq!(orders.command("one", Command::Start, &runs), Status::Good);
+        assert_eq!(state(&orders), OrderState::Running);
+        for command in [Command::Start, Command::Cancel, Command::Clear] {
+            assert_eq!(orders.command("one", command, &runs), Status::InvalidState);
+        }
+        assert_eq!(
+            orders.command("one", Command::Pause, &runs),
+            Status::UnableToAccept
+        );
+        *runs.outcome.lock().unwrap() = Some(JobOutcome::Done);
+        assert!(orders.poll(&runs));
+        assert_eq!(state(&orders), OrderState::Ended);
+        assert_eq!(orders.command("one", Command::Clear, &runs), Status::Good);
+        assert!(orders.all().is_empty());
+        assert_eq!(
+            *runs.calls.lock().unwrap(),
+            ["start urn:p"],
+            "it was started once"
+        );
+    }
+
+    #[test]
+    fn a_start_that_is_revoked_is_never_executed() {
+        let runs = Fakes::default();
+        *runs.is_busy.lock().unwrap() = true;
+        let mut orders = Orders::default();
+        orders.store(job_order("one", "urn:p"), &runs);
+        assert_eq!(orders.command("one", Command::Start, &runs), Status::Good);
+        assert_eq!(state(&orders), OrderState::AllowedToStart);
+        assert_eq!(
+            orders.command("one", Command::RevokeStart, &runs),
+            Status::Good
+        );
+        *runs.is_busy.lock().unwrap() = false;
+        orders.poll(&runs);
+        assert_eq!(state(&orders), OrderState::NotAllowedToStart);
+        assert!(runs.calls.lock().unwrap().is_empty());
+    }
+
+    #[test]
+    fn a_stop_ends_the_order_only_when_the_end_is_confirmed() {
+        for (command, end) in [
+            (Command::Stop, OrderState::Ended),
+            (Command::Abort, OrderState::Aborted),
+        ] {
+            let runs = Fakes::default();
+            let mut orders = Orders::default();
+            orders.store(job_order("one", "urn:p"), &runs);
+            orders.command("one", Command::Start, &runs);
+            assert_eq!(orders.command("one", command, &runs), Status::Good);
+            assert_eq!(state(&orders), OrderState::Running, "it still runs");
+            *runs.outcome.lock().unwrap() = Some(JobOutcome::Unknown);
+            orders.poll(&runs);
+            assert_eq!(state(&orders), OrderState::Interrupted);
+            assert_eq!(
+                orders.command("one", Command::Resume, &runs),
+                Status::UnableToAccept
+            );
+            assert_eq!(orders.command("one", command, &runs), Status::Good);
+            assert_eq!(state(&orders), end);
+            assert_eq!(
+                *runs.calls.lock().unwrap(),
+                ["start urn:p", "stop 7", "stop 7"]
+            );
+        }
+    }
+
+    #[test]
+    fn requirements_that_no_plan_checks_are_refused() {
+        let runs = Fakes::default();
+        let mut orders = Orders::default();
+        let parameter = Parameter::default();
+        let with = JobOrder {
+            parameters: Some(vec![parameter]),
+            ..job_order("one", "urn:p")
+        };
+        assert_eq!(orders.store(with, &runs), Status::UnableToAccept);
+        let empty = JobOrder {
+            parameters: Some(Vec::new()),
+            ..job_order("one", "urn:p")
+        };
+        assert_eq!(orders.store(empty, &runs), Status::Good);
+    }
+}

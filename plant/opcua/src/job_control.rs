@@ -1,0 +1,387 @@
+//! Job Control (OPC 10031-4, version 2): the structures of job orders and job responses, and the part
+//! of the NodeSet that servers of jobs need.
+
+use std::io::{Read, Write};
+use std::sync::LazyLock;
+
+use opcua::types::{
+    BinaryDecodable, BinaryEncodable, Context, DateTime, EUInformation, EncodingResult,
+    ExpandedMessageInfo, ExpandedNodeId, LocalizedText, RelativePath, StaticTypeLoader,
+    TypeLoaderInstance, UAString, UaNullable, Variant, XmlEncodable, XmlType, binary_decode_to_enc,
+};
+
+/// The namespace of Job Control, version 2.
+pub const NAMESPACE: &str = "http://opcfoundation.org/UA/ISA95-JOBCONTROL_V2/";
+/// The NodeSet: the structures, the job order receiver and the job response provider.
+pub const NODESET: &str = include_str!("job_control.xml");
+
+/// Defines a structure with the identifiers of its DataType and of its binary encoding.
+macro_rules! structures {
+    ($($(#[$doc:meta])* $name:ident = ($data_type:literal, $binary:literal) {
+        $($(#[$field:meta])* $key:ident: $of:ty,)+
+    })+) => {
+        $(
+            $(#[$doc])*
+            #[derive(
+                Debug, Clone, PartialEq, Default, BinaryEncodable, BinaryDecodable, XmlEncodable,
+                XmlType, UaNullable,
+            )]
+            pub struct $name {
+                $($(#[$field])* pub $key: $of,)+
+            }
+
+            impl ExpandedMessageInfo for $name {
+                fn full_type_id(&self) -> ExpandedNodeId {
+                    ExpandedNodeId::new_with_namespace(NAMESPACE, $binary)
+                }
+
+                // Clients of this server use the binary encoding.
+                fn full_json_type_id(&self) -> ExpandedNodeId {
+                    self.full_type_id()
+                }
+
+                fn full_xml_type_id(&self) -> ExpandedNodeId {
+                    self.full_type_id()
+                }
+
+                fn full_data_type_id(&self) -> ExpandedNodeId {
+                    ExpandedNodeId::new_with_namespace(NAMESPACE, $data_type)
+                }
+            }
+        )+
+
+        fn types() -> TypeLoaderInstance {
+            let mut types = TypeLoaderInstance::new();
+            $(types.add_binary_type($data_type, $binary, binary_decode_to_enc::<$name>);)+
+            types
+        }
+    };
+}
+
+structures! {
+    /// ISA95PropertyDataType: a property of a resource.
+    Property = (3002_u32, 5002_u32) {
+        /// The ID.
+        id: UAString,
+        /// The value.
+        value: Variant,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<Vec<LocalizedText>>,
+        /// The unit of the value.
+        #[opcua(optional)]
+        units: Option<EUInformation>,
+        /// The properties of the property.
+        #[opcua(optional)]
+        parts: Option<Nested<Property>>,
+    }
+    /// ISA95ParameterDataType: a named value.
+    Parameter = (3003_u32, 5005_u32) {
+        /// The ID.
+        id: UAString,
+        /// The value.
+        value: Variant,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<Vec<LocalizedText>>,
+        /// The unit of the value.
+        #[opcua(optional)]
+        units: Option<EUInformation>,
+        /// The parameters of the parameter.
+        #[opcua(optional)]
+        parts: Option<Nested<Parameter>>,
+    }
+    /// ISA95EquipmentDataType: required or used equipment.
+    Equipment = (3005_u32, 5008_u32) {
+        /// The ID.
+        id: UAString,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<Vec<LocalizedText>>,
+        /// The use of the equipment.
+        #[opcua(optional)]
+        usage: Option<UAString>,
+        /// The quantity.
+        #[opcua(optional)]
+        quantity: Option<UAString>,
+        /// The unit of the quantity.
+        #[opcua(optional)]
+        units: Option<EUInformation>,
+        /// The properties.
+        #[opcua(optional)]
+        properties: Option<Vec<Property>>,
+    }
+    /// ISA95StateDataType: a state of a job.
+    State = (3006_u32, 5029_u32) {
+        /// The path to a substate; empty for the main state.
+        path: RelativePath,
+        /// The name.
+        text: LocalizedText,
+        /// The number.
+        number: u32,
+    }
+    /// ISA95WorkMasterDataType: the work that a job order does.
+    WorkMaster = (3007_u32, 5011_u32) {
+        /// The ID.
+        id: UAString,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<LocalizedText>,
+        /// The parameters.
+        #[opcua(optional)]
+        parameters: Option<Vec<Parameter>>,
+    }
+    /// ISA95JobOrderDataType: a job order.
+    JobOrder = (3008_u32, 5014_u32) {
+        /// The ID, which the client chooses.
+        id: UAString,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<Vec<LocalizedText>>,
+        /// The possible work.
+        #[opcua(optional)]
+        work_masters: Option<Vec<WorkMaster>>,
+        /// The proposed start.
+        #[opcua(optional)]
+        start: Option<DateTime>,
+        /// The proposed end.
+        #[opcua(optional)]
+        end: Option<DateTime>,
+        /// The priority; a higher number comes first.
+        #[opcua(optional)]
+        priority: Option<i16>,
+        /// The parameters.
+        #[opcua(optional)]
+        parameters: Option<Vec<Parameter>>,
+        /// The required persons.
+        #[opcua(optional)]
+        personnel: Option<Vec<Personnel>>,
+        /// The required equipment.
+        #[opcua(optional)]
+        equipment: Option<Vec<Equipment>>,
+        /// The required assets.
+        #[opcua(optional)]
+        assets: Option<Vec<Asset>>,
+        /// The required material.
+        #[opcua(optional)]
+        material: Option<Vec<Material>>,
+    }
+    /// ISA95MaterialDataType: required or used material.
+    Material = (3010_u32, 5017_u32) {
+        /// The ID of its class.
+        #[opcua(optional)]
+        class: Option<UAString>,
+        /// The ID of its definition.
+        #[opcua(optional)]
+        definition: Option<UAString>,
+        /// The ID of its lot.
+        #[opcua(optional)]
+        lot: Option<UAString>,
+        /// The ID of its sublot.
+        #[opcua(optional)]
+        sublot: Option<UAString>,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<Vec<LocalizedText>>,
+        /// The use of the material.
+        #[opcua(optional)]
+        usage: Option<UAString>,
+        /// The quantity.
+        #[opcua(optional)]
+        quantity: Option<UAString>,
+        /// The unit of the quantity.
+        #[opcua(optional)]
+        units: Option<EUInformation>,
+        /// The properties.
+        #[opcua(optional)]
+        properties: Option<Vec<Property>>,
+    }
+    /// ISA95PersonnelDataType: required or working persons.
+    Personnel = (3011_u32, 5020_u32) {
+        /// The ID.
+        id: UAString,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<Vec<LocalizedText>>,
+        /// The task of the persons.
+        #[opcua(optional)]
+        usage: Option<UAString>,
+        /// The quantity.
+        #[opcua(optional)]
+        quantity: Option<UAString>,
+        /// The unit of the quantity.
+        #[opcua(optional)]
+        units: Option<EUInformation>,
+        /// The properties.
+        #[opcua(optional)]
+        properties: Option<Vec<Property>>,
+    }
+    /// ISA95PhysicalAssetDataType: a required or used asset.
+    Asset = (3012_u32, 5023_u32) {
+        /// The ID.
+        id: UAString,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<Vec<LocalizedText>>,
+        /// The use of the asset.
+        #[opcua(optional)]
+        usage: Option<UAString>,
+        /// The quantity.
+        #[opcua(optional)]
+        quantity: Option<UAString>,
+        /// The unit of the quantity.
+        #[opcua(optional)]
+        units: Option<EUInformation>,
+        /// The properties.
+        #[opcua(optional)]
+        properties: Option<Vec<Property>>,
+    }
+    /// ISA95JobResponseDataType: the execution of a job order.
+    JobResponse = (3013_u32, 5026_u32) {
+        /// The ID.
+        id: UAString,
+        /// The description.
+        #[opcua(optional)]
+        description: Option<LocalizedText>,
+        /// The ID of the job order.
+        order_id: UAString,
+        /// The start.
+        #[opcua(optional)]
+        start: Option<DateTime>,
+        /// The end.
+        #[opcua(optional)]
+        end: Option<DateTime>,
+        /// The states, the main state first.
+        states: Option<Vec<State>>,
+        /// The results.
+        #[opcua(optional)]
+        data: Option<Vec<Parameter>>,
+        /// The persons.
+        #[opcua(optional)]
+        personnel: Option<Vec<Personnel>>,
+        /// The equipment.
+        #[opcua(optional)]
+        equipment: Option<Vec<Equipment>>,
+        /// The assets.
+        #[opcua(optional)]
+        assets: Option<Vec<Asset>>,
+        /// The material.
+        #[opcua(optional)]
+        material: Option<Vec<Material>>,
+    }
+    /// ISA95JobOrderAndStateDataType: a job order with its states.
+    JobOrderAndState = (3015_u32, 5032_u32) {
+        /// The job order.
+        order: JobOrder,
+        /// The states, the main state first.
+        states: Option<Vec<State>>,
+    }
+}
+
+/// Structures inside a structure of the same type. Their depth is limited when they are decoded.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Nested<T>(pub Vec<T>);
+
+impl<T: BinaryEncodable> BinaryEncodable for Nested<T> {
+    fn byte_len(&self, ctx: &Context<'_>) -> usize {
+        let parts = self.0.iter().map(|part| part.byte_len(ctx));
+        parts.fold(4, usize::saturating_add)
+    }
+
+    fn encode<S: Write + ?Sized>(&self, stream: &mut S, ctx: &Context<'_>) -> EncodingResult<()> {
+        let count = i32::try_from(self.0.len()).unwrap_or(i32::MAX);
+        BinaryEncodable::encode(&count, stream, ctx)?;
+        let mut parts = self.0.iter();
+        parts.try_for_each(|part| BinaryEncodable::encode(part, stream, ctx))
+    }
+}
+
+impl<T: BinaryDecodable> BinaryDecodable for Nested<T> {
+    fn decode<S: Read + ?Sized>(stream: &mut S, ctx: &Context<'_>) -> EncodingResult<Self> {
+        let _depth = ctx.options().depth_lock()?;
+        let parts: Option<Vec<T>> = BinaryDecodable::decode(stream, ctx)?;
+        Ok(Self(parts.unwrap_or_default()))
+    }
+}
+
+impl<T> UaNullable for Nested<T> {
+    fn is_ua_null(&self) -> bool {
+        self.0.is_empty()
+    }
+}
+
+impl<T> XmlType for Nested<T> {
+    const TAG: &'static str = "ListOfExtensionObject";
+}
+
+impl<T: XmlEncodable> XmlEncodable for Nested<T> {
+    fn encode(
+        &self,
+        stream: &mut opcua::types::xml::XmlStreamWriter<&mut dyn Write>,
+        ctx: &Context<'_>,
+    ) -> EncodingResult<()> {
+        self.0
+            .iter()
+            .try_for_each(|part| XmlEncodable::encode(part, stream, ctx))
+    }
+}
+
+/// Decodes the structures that clients send.
+pub struct Types;
+
+impl StaticTypeLoader for Types {
+    fn instance() -> &'static TypeLoaderInstance {
+        static TYPES: LazyLock<TypeLoaderInstance> = LazyLock::new(types);
+        &TYPES
+    }
+
+    fn namespace() -> &'static str {
+        NAMESPACE
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use opcua::types::ContextOwned;
+
+    use super::*;
+
+    #[test]
+    fn optional_fields_have_a_mask_and_come_back() {
+        let master = WorkMaster {
+            id: "urn:p".into(),
+            ..WorkMaster::default()
+        };
+        let order = JobOrder {
+            id: "one".into(),
+            work_masters: Some(vec![master]),
+            priority: Some(3),
+            ..JobOrder::default()
+        };
+        let context = ContextOwned::default();
+        let context = context.context();
+        let bytes = order.encode_to_vec(&context);
+        // The second and the fifth of the optional fields.
+        assert_eq!(bytes.get(..4), Some(&[0b1_0010, 0, 0, 0][..]));
+        assert_eq!(bytes.len(), order.byte_len(&context));
+        let read = JobOrder::decode(&mut bytes.as_slice(), &context).unwrap();
+        assert_eq!(read, order);
+    }
+
+    #[test]
+    fn parameters_are_not_decoded_to_any_depth() {
+        let nested = |depth: usize| {
+            (0..depth).fold(Parameter::default(), |inner, _| Parameter {
+                parts: Some(Nested(vec![inner])),
+                ..Parameter::default()
+            })
+        };
+        let context = ContextOwned::default();
+        let context = context.context();
+        let bytes = nested(5).encode_to_vec(&context);
+        let read = Parameter::decode(&mut bytes.as_slice(), &context);
+        assert_eq!(read.unwrap(), nested(5));
+        let bytes = nested(500).encode_to_vec(&context);
+        assert!(Parameter::decode(&mut bytes.as_slice(), &context).is_err());
+    }
+}
