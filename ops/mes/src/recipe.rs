@@ -14,6 +14,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use knowledge::is_iri;
+use mtp::escaped;
 use roxmltree::{Document, Node, ParsingOptions};
 use serde::Deserialize;
 use skills::TypeName;
@@ -198,10 +199,20 @@ impl<'d> Reading<'d> {
         self.names.get(name).map_or(name, String::as_str)
     }
 
-    /// Returns the need for a capability or a type of skills. The number of its role is set with
-    /// the order of the steps.
-    fn need(&self, wanted: &str) -> Option<Need> {
-        let wanted = wanted.trim();
+    /// Returns the IRI of a process by its ID.
+    fn iri(&self, id: &str, kind: &str) -> String {
+        let named = self.named(id);
+        let is_meant = self.names.contains_key(id) || is_absolute(named);
+        match is_meant && is_iri(named) {
+            true => named.to_owned(),
+            false => format!("urn:ua-bridge:{kind}:{}", escaped(id)),
+        }
+    }
+
+    /// Returns the need for the capability or the type of skills that a name of the file stands for,
+    /// or is. The number of its role is set with the order of the steps.
+    fn need(&self, name: &str) -> Option<Need> {
+        let wanted = self.named(name).trim();
         let role = Role::Alone(0);
         if wanted.starts_with("nsu=") {
             let skill_type: TypeName = wanted.parse().ok()?;
@@ -211,12 +222,18 @@ impl<'d> Reading<'d> {
                 skill_type: Some(skill_type),
             });
         }
-        is_iri(wanted).then(|| Need {
+        let is_meant = self.names.contains_key(name) || is_absolute(wanted);
+        (is_meant && is_iri(wanted)).then(|| Need {
             role,
             capability: Some(wanted.to_owned()),
             skill_type: None,
         })
     }
+}
+
+/// Returns whether a text is meant as an IRI. A name with a colon has the syntax of an IRI too.
+fn is_absolute(text: &str) -> bool {
+    text.starts_with("urn:") || text.contains("://")
 }
 
 /// Returns the first child element with a name.

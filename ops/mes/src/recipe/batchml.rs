@@ -107,13 +107,8 @@ impl<'d> Reading<'d> {
         let flow = self.resolved(parts);
         let steps = self.steps(&flow)?;
         let description = text_of(recipe, "Description");
-        let named = self.named(id);
-        let iri = match knowledge::is_iri(named) {
-            true => named.to_owned(),
-            false => format!("urn:ua-bridge:recipe:{}", escaped(id)),
-        };
         Some(Process {
-            iri,
+            iri: self.iri(id, "recipe"),
             name: if description.is_empty() {
                 id
             } else {
@@ -532,7 +527,7 @@ impl<'d> Reading<'d> {
         let named = [id, block, description].into_iter().chain(required);
         let need = named
             .filter(|name| !name.is_empty())
-            .find_map(|name| self.need(self.named(name)));
+            .find_map(|name| self.need(name));
         if need.is_some() {
             return need;
         }
@@ -546,6 +541,8 @@ impl<'d> Reading<'d> {
         if let Some((service, procedure)) = service
             && [equipment, service, procedure].into_iter().all(is_plain)
             && !procedure.contains(':')
+            // Tools number the elements of a recipe, as 001:Dosing.
+            && service.starts_with(char::is_alphabetic)
         {
             let equipment = escaped(self.named(equipment));
             return Some(Need {

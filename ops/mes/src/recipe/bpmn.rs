@@ -8,7 +8,6 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use mtp::escaped;
 use roxmltree::Node;
 
 use super::flow::{self, Flow, NodeCondition, NodeKind};
@@ -85,13 +84,8 @@ impl<'d> Reading<'d> {
             return None;
         }
         let steps = self.steps(&parts.flow)?;
-        let named = self.named(id);
-        let iri = match knowledge::is_iri(named) {
-            true => named.to_owned(),
-            false => format!("urn:ua-bridge:bpmn:{}", escaped(id)),
-        };
         Some(Process {
-            iri,
+            iri: self.iri(id, "bpmn"),
             name: process.attribute("name").unwrap_or(id).to_owned(),
             work: Job::Sequence,
             steps,
@@ -220,10 +214,7 @@ impl<'d> Reading<'d> {
             definition.and_then(|definition| definition.attribute("type")),
             topic.map(|topic| topic.value()),
         ];
-        let need = named
-            .into_iter()
-            .flatten()
-            .find_map(|name| self.need(self.named(name)));
+        let need = named.into_iter().flatten().find_map(|name| self.need(name));
         let Some(need) = need else {
             self.error(
                 task,

@@ -43,6 +43,7 @@ fn a_master_recipe_is_a_process_with_the_order_of_its_procedure_logic() {
         .collect();
     assert_eq!(waits, [vec![], vec![0], vec![], vec![1, 2]]);
     let need = |step: &Step| step.needs.first().cloned().unwrap();
+    assert_eq!(need(&steps[0]).capability, None, "`Dosing:Fill` is no IRI");
     assert_eq!(
         need(&steps[0]).skill_type.unwrap().to_string(),
         "nsu=urn:ua-bridge:mtp:dosing;Dosing-FillSkillType"
@@ -54,7 +55,7 @@ fn a_master_recipe_is_a_process_with_the_order_of_its_procedure_logic() {
     let amount = &steps[0].parameters[0];
     assert_eq!(
         (amount.name.as_str(), &amount.value, amount.unit.as_deref()),
-        ("Amount", &json!(2500.0), Some("ml")),
+        ("Amount", &json!(2500), Some("ml")),
         "the reference leads to the formula"
     );
 }
@@ -308,6 +309,20 @@ fn an_exclusive_gateway_needs_a_default_flow_and_results_need_their_step() {
         skipped[0].contains("which is not done whenever `e` begins"),
         "{skipped:?}"
     );
+}
+
+#[test]
+fn recipes_come_back_from_the_graph_as_they_were() {
+    for text in [BATCH, BPMN] {
+        let recipe = read(text, &Names::new()).unwrap();
+        let knowledge = knowledge::Knowledge::new().unwrap();
+        let source = knowledge::Source::new(knowledge::SourceKind::Process, "a recipe");
+        let triples = recipe.processes[0].triples(&|_| None);
+        knowledge.replace(&source, &triples, 1).unwrap();
+        let read = crate::read_process::Processes::read(&knowledge).unwrap();
+        assert_eq!(read.faults, std::collections::BTreeMap::new());
+        assert_eq!(read.all, recipe.processes);
+    }
 }
 
 #[test]
