@@ -3,6 +3,7 @@ status codes of the responses."""
 
 import argparse
 import asyncio
+import datetime
 import logging
 
 from asyncua import Client, ua
@@ -20,6 +21,7 @@ UNKNOWN = ua.NodeId(9999, 2)
 ELSEWHERE = ua.NodeId(1, 999)
 OBJECTS = ua.NodeId(ua.ObjectIds.ObjectsFolder)
 SERVER = ua.NodeId(ua.ObjectIds.Server)
+SET_DURABLE = ua.NodeId(ua.ObjectIds.Server_SetSubscriptionDurable)
 GET_ITEMS = ua.NodeId(ua.ObjectIds.Server_GetMonitoredItems)
 TIME = ua.NodeId(ua.ObjectIds.Server_ServerStatus_CurrentTime)
 VALUE = ua.AttributeIds.Value
@@ -172,8 +174,30 @@ class Server:
         return " ".join(f"{one.Value.Value.Value:g}/{one.Value.StatusCode.value & 0xFFFF:x}" for one in items)
 
 
+    async def first(self, wanted):
+        """Returns the first notification of an item, as `value/status`."""
+        subscription = await self.subscribed(PublishingEnabled=True)
+        (await self.create({"subscription": subscription, **wanted})).StatusCode.check()
+        data = None
+        while not data:
+            # The first message is a keep-alive.
+            data = (await self.ask("Publish")).NotificationMessage.NotificationData
+        (await self.one("DeleteSubscriptions", SubscriptionIds=[subscription])).check()
+        value = data[0].MonitoredItems[0].Value
+        return f"{value.Value.Value:g}/{value.StatusCode.value & 0xFFFF:x}"
+
+
 def changes(trigger=ua.DataChangeTrigger.StatusValue, kind=0, value=0.0):
     return ua.DataChangeFilter(trigger, kind, value)
+
+
+def aggregate(name="Average", interval=1_000.0, start=None):
+    found = ua.AggregateFilter()
+    found.StartTime = start or ua.get_win_epoch()
+    found.AggregateType = ua.NodeId(getattr(ua.ObjectIds, f"AggregateFunction_{name}"))
+    found.ProcessingInterval = interval
+    found.AggregateConfiguration.UseServerCapabilitiesDefaults = True
+    return found
 
 
 def events():
@@ -365,6 +389,29 @@ rows(
 )
 row("Call", "5.12.2", "no methods", "BadNothingToDo")(lambda server: server.ask("Call"))
 
+
+def durable(server, subscription, hours):
+    arguments = [ua.Variant(number, ua.VariantType.UInt32) for number in (subscription, hours)]
+    return server.call({"method": SET_DURABLE, "arguments": arguments})
+
+
+@row("Call", "10000-5, 9.3", "lifetimes of durable subscriptions in hours", "1 is 1, 0 is 168, 1000 is 168")
+async def _(server):
+    subscription, found = await server.subscribed(), []
+    for hours in (1, 0, 1_000):
+        result = await durable(server, subscription, hours)
+        result.StatusCode.check()
+        found.append(f"{hours} is {result.OutputArguments[0].Value}")
+    return ", ".join(found)
+
+
+row("Call", "10000-5, 9.3", "a durable subscription with items", "BadInvalidState")(
+    lambda server: durable(server, server.subscription, 1)
+)
+row("Call", "10000-5, 9.3", "an unknown durable subscription", "BadSubscriptionIdInvalid")(
+    lambda server: durable(server, 1 << 30, 1)
+)
+
 rows(
     "CreateMonitoredItems",
     "5.13.2",
@@ -395,7 +442,12 @@ rows(
             "BadMonitoredItemFilterUnsupported",
             {"filter": changes(kind=PERCENT, value=10.0)},
         ),
-        ("an aggregate filter", "BadMonitoredItemFilterUnsupported", {"filter": ua.AggregateFilter()}),
+        ("an aggregate", "Good", {"filter": aggregate()}),
+        ("an unknown aggregate", "BadAggregateNotSupported", {"filter": aggregate("NumberOfTransitions")}),
+        ("an aggregate of a value without history", "BadMonitoredItemFilterUnsupported", {"node": TIME, "filter": aggregate()}),
+        ("an aggregate of a name", "BadFilterNotAllowed", {"attribute": NAME, "filter": aggregate()}),
+        ("an aggregate of parts of an array", "BadMonitoredItemFilterUnsupported", {"node": LIST, "range": "0:1", "filter": aggregate()}),
+        ("a negative processing interval", "BadMonitoredItemFilterInvalid", {"filter": aggregate(interval=-1.0)}),
     ],
     Server.create,
 )
@@ -411,6 +463,24 @@ async def _(server):
         created = await server.create({"sampling": wanted})
         found.append(f"{wanted:g} is {created.RevisedSamplingInterval:g}")
     return ", ".join(found)
+
+
+@row("CreateMonitoredItems", "7.22.4", "processing intervals", "0 is 100, 125.5 is 125.5")
+async def _(server):
+    found = []
+    for wanted in (0.0, 125.5):
+        created = await server.create({"filter": aggregate(interval=wanted)})
+        found.append(f"{wanted:g} is {created.FilterResult.RevisedProcessingInterval:g}")
+    return ", ".join(found)
+
+
+@row("CreateMonitoredItems", "7.22.4", "the Maximum of an interval", "9/401")
+async def _(server):
+    # The interval began before the values, and ends behind them.
+    start = datetime.datetime.now(datetime.timezone.utc) - datetime.timedelta(milliseconds=500)
+    for value in (7.0, 9.0, 8.0):
+        (await server.write({"value": value})).check()
+    return await server.first({"filter": aggregate("Maximum", 1_500.0, start)})
 
 
 row("CreateMonitoredItems", "5.13.1.5", "an overflow that discards the oldest value", "3/480 4/0")(

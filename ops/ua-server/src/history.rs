@@ -251,7 +251,7 @@ impl Series {
         if whole == 0 || whole.div_ceil(step) > MOST_INTERVALS {
             return Err(StatusCode::BadInvalidArgument);
         }
-        let rules = rules(&details.aggregate_configuration);
+        let rules = rules(&details.aggregate_configuration)?;
         let samples = self.samples();
         let mut values = Vec::new();
         let mut done = 0;
@@ -420,15 +420,24 @@ fn decoded(view: &View<'_>) -> Option<Variant> {
     small.then(|| view.data_value(&NumericRange::None).value)?
 }
 
-fn rules(asked: &AggregateConfiguration) -> Rules {
+/// Returns the rules of a request.
+///
+/// # Errors
+/// Returns `BadAggregateInvalidInputs` for percentages that contradict each other (OPC 10000-13,
+/// 4.2.1.2).
+fn rules(asked: &AggregateConfiguration) -> Result<Rules, StatusCode> {
     if asked.use_server_capabilities_defaults {
-        return Rules::default();
+        return Ok(Rules::default());
     }
-    Rules {
+    let (bad, good) = (asked.percent_data_bad, asked.percent_data_good);
+    if bad > 100 || good > 100 || u16::from(bad) + u16::from(good) < 100 {
+        return Err(StatusCode::BadAggregateInvalidInputs);
+    }
+    Ok(Rules {
         uncertain_is_bad: asked.treat_uncertain_as_bad,
-        percent_bad: asked.percent_data_bad,
-        percent_good: asked.percent_data_good,
-    }
+        percent_bad: bad,
+        percent_good: good,
+    })
 }
 
 /// Returns the values of a span, without its end. The order is forward from the start, or backward
@@ -706,6 +715,23 @@ mod tests {
             ]
             .concat()
         );
+    }
+
+    #[test]
+    fn percentages_that_contradict_each_other_are_refused() {
+        let asked = |percent_data_bad, percent_data_good| {
+            let configuration = AggregateConfiguration {
+                percent_data_bad,
+                percent_data_good,
+                ..AggregateConfiguration::default()
+            };
+            rules(&configuration).map(|rules| (rules.percent_bad, rules.percent_good))
+        };
+        assert_eq!(asked(50, 50), Ok((50, 50)));
+        for (bad, good) in [(49, 50), (101, 100), (100, 101)] {
+            let refused = Err(StatusCode::BadAggregateInvalidInputs);
+            assert_eq!(asked(bad, good), refused, "{bad}, {good}");
+        }
     }
 
     #[test]

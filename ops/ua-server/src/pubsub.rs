@@ -23,7 +23,8 @@ use opcua::server::address_space::AddressSpace;
 use opcua::server::node_manager::memory::CoreNodeManager;
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
-    AttributeId, DataValue, MethodId, NodeId, ObjectId, StatusCode, TimestampsToReturn, Variant,
+    AttributeId, DataValue, MethodId, NodeId, ObjectId, StatusCode, TimestampsToReturn, UAString,
+    VariableId, Variant,
 };
 use plant_opcua::file::Handles;
 use plant_opcua::server::{CoreMethod, MethodHandler, Refusal, method};
@@ -52,6 +53,15 @@ pub(crate) struct PubSub {
     places: OnceLock<Places>,
     /// The open handles of the configuration file. No other lock is held when this lock is taken.
     file: Mutex<Handles>,
+}
+
+/// Returns the values of the object PublishSubscribe that do not change.
+pub(crate) fn capabilities() -> Vec<(VariableId, Variant)> {
+    let profiles: Vec<UAString> = insert::PROFILES.into_iter().map(UAString::from).collect();
+    vec![(
+        VariableId::PublishSubscribe_SupportedTransportProfiles,
+        profiles.into(),
+    )]
 }
 
 /// The node managers of the nodes, and their subscriptions.

@@ -27,6 +27,7 @@ variables:
 const CALCULATED: u32 = 0x0401;
 const INTERPOLATED: u32 = 0x0402;
 const BAD: u32 = 0x8000_0000;
+const NO_DATA: u32 = 0x809B_0000;
 
 /// The start of the times in queries, in nanoseconds.
 const EPOCH: i128 = 1_700_000_000_000_000_000;
@@ -187,7 +188,7 @@ fn aggregates_of_past_values_are_worked_out_for_each_interval() {
     let with_the_bad_one = json!([
         [0, 3.0, CALCULATED],
         [2000, 6.0, CALCULATED],
-        [4000, null, BAD]
+        [4000, null, NO_DATA]
     ]);
     let counts = json!([[0, 2, CALCULATED], [2000, 2, CALCULATED]]);
     assert_answers(

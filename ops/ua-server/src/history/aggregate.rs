@@ -182,7 +182,7 @@ fn of_values(
         return Outcome::NoData;
     };
     let (Some(first), Some(last)) = (good.first(), good.last()) else {
-        return Outcome::Bad;
+        return Outcome::NoData;
     };
     if quality == Quality::Bad {
         return Outcome::Bad;
@@ -293,7 +293,7 @@ fn average_over_time(samples: &[Sample], (from, to): (i64, i64), rules: Rules) -
 }
 
 /// Returns the time with good values, in ticks. Each value counts until the next value (OPC
-/// 10000-13, 5.4.3.22).
+/// 10000-13, 5.4.3.22). The start of the interval has a good value between two good samples only.
 fn time_good(samples: &[Sample], (from, to): (i64, i64)) -> f64 {
     let mut good = 0.0;
     let first = samples.partition_point(|one| one.time <= from);
@@ -302,9 +302,11 @@ fn time_good(samples: &[Sample], (from, to): (i64, i64)) -> f64 {
         .get(first.saturating_sub(1)..end)
         .unwrap_or_default();
     let nexts = samples.iter().skip(1).map(|next| next.time);
-    for (sample, next) in samples.iter().zip(nexts.chain([i64::MAX])) {
+    let is_good = |sample: Option<&Sample>| sample.is_none_or(|one| one.quality == Quality::Good);
+    for (place, (sample, next)) in samples.iter().zip(nexts.chain([i64::MAX])).enumerate() {
         let (begin, end) = (sample.time.max(from), next.min(to));
-        if sample.quality == Quality::Good && end > begin {
+        let follower = samples.get(place + 1).filter(|_| sample.time < from);
+        if is_good(Some(sample)) && is_good(follower) && end > begin {
             good += length((begin, end));
         }
     }
@@ -345,8 +347,13 @@ pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
     let Some(from) = low.value else {
         return Outcome::Held(last);
     };
-    // Bad samples in between make the value uncertain.
+    // Bad samples in between, and uncertain samples at the ends, make the value uncertain.
     let skipped = before.len() - 1 != last || after.first() != first;
+    let ends = [Some(low), first];
+    let doubtful = ends
+        .iter()
+        .flatten()
+        .any(|end| end.quality != Quality::Good);
     match first {
         Some(Sample {
             time: next,
@@ -355,7 +362,7 @@ pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
         }) => {
             let whole = (next - low.time).max(1);
             let part = (time - low.time) as f64 / whole as f64;
-            let quality = match skipped {
+            let quality = match skipped || doubtful {
                 true => Quality::Uncertain,
                 false => Quality::Good,
             };
@@ -411,6 +418,9 @@ impl Rules {
         )
     }
 }
+
+#[cfg(test)]
+mod examples;
 
 #[cfg(test)]
 mod tests {
@@ -491,7 +501,7 @@ mod tests {
             at(&all, 15, Rules::default()),
             Outcome::Interpolated(1.5, Quality::Uncertain)
         );
-        assert_eq!(of_all(Aggregate::Average, &all, (20, 30)), Outcome::Bad);
+        assert_eq!(of_all(Aggregate::Average, &all, (20, 30)), Outcome::NoData);
         all[1].quality = Quality::Uncertain;
         let lenient = Rules {
             uncertain_is_bad: false,

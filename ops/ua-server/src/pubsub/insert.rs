@@ -542,6 +542,8 @@ pub(super) const CONNECTION: &str = "space";
 const MQTT_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-mqtt-uadp";
 const MQTT_JSON: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-mqtt-json";
 const UDP_UADP: &str = "http://opcfoundation.org/UA-Profile/Transport/pubsub-udp-uadp";
+/// The profiles that a mapping selects from.
+pub(super) const PROFILES: [&str; 3] = [UDP_UADP, MQTT_UADP, MQTT_JSON];
 const UINT16: (DataTypeId, i32) = (DataTypeId::UInt16, -1);
 const UINT32: (DataTypeId, i32) = (DataTypeId::UInt32, -1);
 const DURATION: (DataTypeId, i32) = (DataTypeId::Duration, -1);

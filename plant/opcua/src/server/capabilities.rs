@@ -33,7 +33,11 @@ pub fn profiles(limits: &Limits, facets: Facets) -> Vec<String> {
         "ComplexTypes2017",
     ]);
     if facets.has_history {
-        names.extend(["HistoricalRawData", "AggregateHistorical"]);
+        names.extend([
+            "HistoricalRawData",
+            "AggregateHistorical",
+            "AggregateSubscription",
+        ]);
     }
     if facets.has_alarms {
         names.extend([
