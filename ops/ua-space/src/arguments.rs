@@ -20,7 +20,9 @@ pub(crate) use tap::Tap;
 pub(crate) use write::Write;
 
 pub(crate) use job::{GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb};
-pub(crate) use module::{AasArguments, MtpArguments, MtpRdf, MtpSkills, MtpVerb, PeaArguments};
+pub(crate) use module::{
+    AasArguments, MtpAlarms, MtpArguments, MtpRdf, MtpSkills, MtpVerb, PeaArguments,
+};
 
 use std::path::PathBuf;
 

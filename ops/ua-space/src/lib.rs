@@ -31,6 +31,7 @@ mod live;
 mod make_keys;
 mod messages;
 mod metadata;
+mod mtp_alarms;
 mod mtp_files;
 mod new;
 mod owl;

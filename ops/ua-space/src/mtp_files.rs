@@ -19,6 +19,7 @@ pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), Failure> {
         MtpVerb::Check(arguments) => check(&arguments.files, arguments.json),
         MtpVerb::Rdf(arguments) => rdf(arguments),
         MtpVerb::Skills(arguments) => skills(arguments),
+        MtpVerb::Alarms(arguments) => crate::mtp_alarms::alarms(arguments),
     }
 }
 

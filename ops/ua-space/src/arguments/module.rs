@@ -18,6 +18,8 @@ pub(crate) enum MtpVerb {
     Rdf(MtpRdf),
     /// List the procedures of a manifest with their parameters and outputs
     Skills(MtpSkills),
+    /// Print the alarms of a manifest as a part of a mapping: variables with conditions at ua-server
+    Alarms(MtpAlarms),
 }
 
 #[derive(Debug, Args)]
@@ -67,6 +69,22 @@ pub(crate) struct AasArguments {
     /// repeated. Without all mandatory fields the nameplate is left out
     #[arg(long, value_name = "NAME=VALUE")]
     pub(crate) nameplate: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MtpAlarms {
+    /// The manifest (.aml, .mtp, .amlx), or - for stdin
+    #[arg(value_name = "FILE")]
+    pub(crate) file: String,
+    /// The index of the namespace of the variables, which the mapping lists
+    #[arg(long, value_name = "INDEX", default_value = "2", value_parser = clap::value_parser!(u16).range(2..))]
+    pub(crate) namespace: u16,
+    /// The identifier of the first variable; the next ones follow
+    #[arg(long, value_name = "ID", default_value = "1", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) first: u16,
+    /// The endpoint of the module, if it differs from the manifest
+    #[arg(long, value_name = "URL")]
+    pub(crate) endpoint: Option<String>,
 }
 
 #[derive(Debug, Args)]

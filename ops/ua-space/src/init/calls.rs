@@ -188,7 +188,7 @@ impl<'m> Names<'m> {
         let executed = mapping.executed_in(space);
         let executed = executed.filter_map(|call| match &call.executed {
             ExecutedBy::Ros(target) => Some((call.kind.word(), target.name.as_str())),
-            ExecutedBy::OpcUa(_) | ExecutedBy::Elsewhere => None,
+            ExecutedBy::OpcUa(_) | ExecutedBy::Acknowledging | ExecutedBy::Elsewhere => None,
         });
         let asked = mapping.asked_in(space);
         let asked = asked.map(|(call, binding)| (call.kind.word(), binding.target.name.as_str()));
