@@ -57,6 +57,8 @@ pub enum ExecutedBy {
     Ros(CallTarget),
     /// A Method of an OPC UA server, called by the cell's server.
     OpcUa(MethodTarget),
+    /// The cell's server, which acknowledges an alarm.
+    Acknowledging,
     /// Another executor in the space, such as a component.
     Elsewhere,
 }

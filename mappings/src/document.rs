@@ -17,7 +17,7 @@ use crate::read::{At, Read, Reader, choice, document, help_octal, is_octal, shor
 use crate::server_entries::{FindSkillsEntry, FromEntry, RemoteServerEntry, ToEntry};
 use crate::tree::{Kind, Node, Place};
 
-pub(crate) use alarm::{AlarmEntry, ReportsEntry};
+pub(crate) use alarm::{AcknowledgesEntry, AlarmEntry, ReportsEntry};
 pub(crate) use carriers::{CarrierEntry, PubSubForm, UdpEntry};
 pub(crate) use security::{
     GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
@@ -194,6 +194,12 @@ document! {
         /// Whether the server has alarms for the publishers of the space: lost, dropped values,
         /// another clock. Default false.
         publisher_alarms: bool,
+        /// Clients to which the server connects, so that they reach it through a firewall that
+        /// permits no connections to it (ReverseHello, OPC 10000-6): their listening addresses, such
+        /// as opc.tcp://192.168.0.30:4841; at most 16. With hosts other than this one, the defaults
+        /// of `security` and `anonymous` are those of an endpoint that other hosts reach.
+        #[schemars(length(max = 16))]
+        reverse_connect: Vec<At<String>>,
         /// Limits of the history of the server.
         history: HistoryEntry,
         /// Limits for clients.
@@ -216,7 +222,8 @@ document! {
         #[schemars(range(min = 1, max = 16384))]
         megabytes: u16,
         /// File in which ua-server stores the history and the states of alarms, so that they
-        /// survive a restart; it is created if it is missing. Without it, they are in memory only.
+        /// survive a restart, relative to this file; it is created if it is missing. Without it,
+        /// they are in memory only.
         file: String,
     }
 
@@ -532,6 +539,11 @@ document! {
         ros: CallBindings,
         /// With `origin: 0`: the Method of another OPC UA server that executes the call.
         opcua: MethodEntry,
+        /// `alarms`, with `origin: 0` and without `opcua`: the server executes the call, and
+        /// acknowledges an alarm. The request has the texts `event_id` and `comment`, the response
+        /// `success` and `message`, as in ua_msgs/AcknowledgeAlarm. The event_id is that of a status
+        /// of `reports: alarms`.
+        acknowledges: AcknowledgesEntry,
         /// Whether requests from other hosts are executed. Default: only requests from a loopback
         /// address, because the sender of unsecured requests is unknown.
         open: bool,

@@ -109,7 +109,7 @@ impl<'a> Loader<'a> {
             }
         }
         self.nodesets(&mut document, &path);
-        for file in key_files(&mut document) {
+        for file in files(&mut document) {
             *file = beside(&path, file);
         }
         self.take(document);
@@ -297,9 +297,12 @@ impl<'a> Loader<'a> {
     }
 }
 
-/// Returns the key files that a document names. An empty path is left out, so that a finding
-/// reports it.
-fn key_files(document: &mut Document) -> impl Iterator<Item = &mut String> {
+/// Returns the key files and the history file that a document names. An empty path is left out, so
+/// that a finding reports it.
+fn files(document: &mut Document) -> impl Iterator<Item = &mut String> {
+    let server = document.server.as_mut().and_then(|at| at.value.as_mut());
+    let history = server.and_then(|server| server.history.as_mut()?.value.as_mut());
+    let history = history.and_then(|history| history.file.as_mut()?.value.as_mut());
     let pubsub = document.pubsub.as_mut().and_then(|at| at.value.as_mut());
     let brokers = pubsub.into_iter().flat_map(PubSubForm::brokers);
     let of_broker = brokers.flat_map(|mqtt| {
@@ -316,8 +319,9 @@ fn key_files(document: &mut Document) -> impl Iterator<Item = &mut String> {
     let groups = document.security.as_mut().and_then(|at| at.value.as_mut());
     let groups = groups.into_iter().flatten();
     let keys = groups.filter_map(|at| at.value.as_mut()?.keys.as_mut()?.value.as_mut());
-    let files = keys.filter_map(|keys| keys.file.as_mut()?.value.as_mut());
-    files.chain(of_broker).filter(|file| !file.is_empty())
+    let keys = keys.filter_map(|keys| keys.file.as_mut()?.value.as_mut());
+    let files = keys.chain(of_broker).chain(history);
+    files.filter(|file| !file.is_empty())
 }
 
 /// Returns the value of a faulty entry.

@@ -485,6 +485,8 @@ pub struct Server {
     pub bad_after: Option<Duration>,
     /// `true` if it has alarms for the publishers of the space.
     pub publisher_alarms: bool,
+    /// Listening addresses of the clients to which the server connects.
+    pub reverse_connect: Vec<Endpoint>,
     /// Size of the history.
     pub history: History,
     /// File of the history.
@@ -528,6 +530,12 @@ impl Server {
         all.filter(|policy| is_loopback || *policy != SecurityPolicy::None)
             .collect()
     }
+
+    /// Returns `true` if the server connects to no client of another host.
+    #[must_use]
+    pub fn connects_to_own_host_only(&self) -> bool {
+        self.reverse_connect.iter().all(Endpoint::is_loopback)
+    }
 }
 
 impl Default for Server {
@@ -541,6 +549,7 @@ impl Default for Server {
             refuse_other_hosts: false,
             bad_after: None,
             publisher_alarms: false,
+            reverse_connect: Vec::new(),
             history: History::default(),
             history_file: None,
             limits: ServerLimits::default(),

@@ -189,6 +189,40 @@ fn a_method_of_another_server_is_asked_for_by_services() {
 }
 
 #[test]
+fn the_server_acknowledges_alarms_for_services() {
+    let checked = check(
+        "  - node: ns=2;i=80
+    name: Alarms.Acknowledge
+    origin: 0
+    acknowledges: alarms
+    ros:
+      - {space: 1, service: /acknowledge, type: ua_msgs/AcknowledgeAlarm}
+      - {space: 2, service: /acknowledge, type: ua_msgs/AcknowledgeAlarm}
+",
+    );
+    let call = only(&checked);
+    assert_eq!(call.executed, ExecutedBy::Acknowledging);
+    assert_eq!(call.asked.len(), 2);
+    let elsewhere = [
+        "origin: 1, ros: {service: /a, type: ua_msgs/AcknowledgeAlarm}",
+        "origin: 0, opcua: {endpoint: 'opc.tcp://127.0.0.1:4841', object: 'ns=2;i=1', method: 'ns=2;i=2'}",
+        "origin: 0, ros: {space: 1, action: /a, type: actionlib/Test}",
+    ];
+    for keys in elsewhere {
+        let call =
+            format!("  - {{node: ns=2;i=80, name: Acknowledge, {keys}, acknowledges: alarms}}");
+        let checked = check(&call);
+        let codes: Vec<Code> = checked.findings.iter().map(|one| one.code).collect();
+        assert!(
+            codes.contains(&Code::Alarm),
+            "{keys}: {}",
+            checked.render_all()
+        );
+        assert!(checked.mapping.is_none(), "{keys}");
+    }
+}
+
+#[test]
 fn a_constant_is_a_value_of_its_field_whoever_executes() {
     let told = |call: &str| {
         let checked = check(call);

@@ -54,6 +54,24 @@ fn variable(id: u16, name: &str) -> String {
     format!("  - {{node: ns=2;i={id}, name: {name}, type: Double, origin: 1}}\n")
 }
 
+#[test]
+fn the_history_is_beside_the_file_that_names_it() {
+    let file = |text: &str| {
+        let part = "server: {history: {file: data/history.redb}}\n";
+        let beside = Beside::default().file("plant/servers/one.yaml", part);
+        let checked = beside.check(text);
+        let mapping = checked.mapping.expect("a mapping without errors");
+        mapping.server().history_file.clone().unwrap()
+    };
+    let own = format!("{HEAD}server: {{history: {{file: history.redb}}}}\n");
+    assert_eq!(file(&own).to_str(), Some("plant/history.redb"));
+    let included = format!("include: servers/one.yaml\n{HEAD}");
+    let wanted = Some("plant/servers/data/history.redb");
+    assert_eq!(file(&included).to_str(), wanted);
+    let absolute = format!("{HEAD}server: {{history: {{file: /var/lib/history.redb}}}}\n");
+    assert_eq!(file(&absolute).to_str(), Some("/var/lib/history.redb"));
+}
+
 fn names(checked: &Checked) -> Vec<&str> {
     let mapping = checked.mapping.as_ref().unwrap();
     let names = mapping.variables().iter().map(|v| v.name.as_str());

@@ -101,7 +101,7 @@ fn a_model_gives_the_topics_that_another_parser_counts() {
         .iter()
         .filter_map(|call| match &call.executed {
             ExecutedBy::Ros(target) => Some(target.name.clone()),
-            ExecutedBy::OpcUa(_) | ExecutedBy::Elsewhere => None,
+            ExecutedBy::OpcUa(_) | ExecutedBy::Acknowledging | ExecutedBy::Elsewhere => None,
         });
     let mut names: Vec<String> = topics.chain(calls).collect();
     names.sort();

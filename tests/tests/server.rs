@@ -15,6 +15,7 @@ mod nodesets;
 mod pubsub;
 mod quality;
 mod redundant;
+mod reverse;
 mod services;
 mod strangers;
 

@@ -284,13 +284,14 @@ fn tree(
 
 const DOC: &str = "usr/share/doc/ua-bridge";
 /// Folders of the ROS packages below `ros/`.
-const ROS_FOLDERS: [&str; 6] = [
+const ROS_FOLDERS: [&str; 7] = [
     "ua_bridge",
     "ua_bridge/launch",
     "ua_bridge/scripts",
     "ua_msgs",
     "ua_msgs/action",
     "ua_msgs/msg",
+    "ua_msgs/srv",
 ];
 /// Folders with examples, and their places below the examples of a package.
 const EXAMPLES: [(&str, &str); 4] = [

@@ -15,7 +15,7 @@ use super::variables::{NAMESPACE_ZERO, Namespaces, Spaces, checked_name, node_id
 use super::{permissions, required};
 use crate::call::{Call, CallBinding, CallKind, ExecutedBy, MethodTarget};
 use crate::code::Code;
-use crate::document::CallEntry;
+use crate::document::{AcknowledgesEntry, CallEntry};
 use crate::endpoint::Endpoint;
 use crate::findings::Findings;
 use crate::mapping::Variable;
@@ -112,7 +112,14 @@ impl Checker<'_> {
             _ => None,
         };
         let (node, topic, (origin, _), kind) = (node?.0, topic?, origin?, kind?);
-        let (executed, asked) = settle(origin, found?, method.ok()?, findings)?;
+        let method = method.ok()?;
+        let acknowledges = acknowledges(entry, (origin, kind), findings)?;
+        let (executed, asked) = settle(origin, found?, method, findings)?;
+        let executed = if acknowledges {
+            ExecutedBy::Acknowledging
+        } else {
+            executed
+        };
         Some(Call {
             topic,
             node,
@@ -250,4 +257,30 @@ fn settle(
         (None, None) => ExecutedBy::Elsewhere,
     };
     Some((executed, asked))
+}
+
+/// Returns whether the server executes the call by acknowledging an alarm. Returns `None` for a
+/// fault, which is noted.
+fn acknowledges(
+    entry: &CallEntry,
+    (origin, kind): (SpaceId, CallKind),
+    findings: &mut Findings,
+) -> Option<bool> {
+    let Some(at) = &entry.acknowledges else {
+        return Some(false);
+    };
+    let AcknowledgesEntry::Alarms = at.value.as_ref()?;
+    let message = if entry.opcua.is_some() {
+        "`acknowledges` stands beside `opcua`".to_owned()
+    } else if origin != SpaceId::UA {
+        format!("the call is executed in space {origin}, not by the server")
+    } else if kind == CallKind::Action {
+        "an alarm is acknowledged by a service, not by an action".to_owned()
+    } else {
+        return Some(true);
+    };
+    findings
+        .error(Code::Alarm, at.place, message)
+        .help("`acknowledges: alarms` requires `origin: 0`, excludes `opcua`, and has services as bindings");
+    None
 }

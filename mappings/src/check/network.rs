@@ -292,6 +292,7 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         refuse_other_hosts: given(&entry.refuse_other_hosts).is_some_and(|(refuse, _)| *refuse),
         bad_after: duration(&entry.bad_after, findings),
         publisher_alarms: given(&entry.publisher_alarms).is_some_and(|(on, _)| *on),
+        reverse_connect: reverse_connect(&entry.reverse_connect, findings),
         history: history(&entry.history, findings),
         history_file: given(&entry.history)
             .and_then(|(history, _)| given(&history.file))
@@ -335,6 +336,35 @@ fn redundant(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> Vec<Str
     }
     uris
 }
+
+/// Returns the clients to which the server connects.
+fn reverse_connect(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> Vec<Endpoint> {
+    let Some((entries, place)) = given(field) else {
+        return Vec::new();
+    };
+    if entries.len() > MAX_REVERSE {
+        let message = format!("{} clients; at most {MAX_REVERSE}", entries.len());
+        findings.error(Code::TooLarge, place, message);
+        return Vec::new();
+    }
+    let mut clients: Vec<Endpoint> = Vec::new();
+    for At { place, value } in entries {
+        let Some(text) = value else { continue };
+        let Some(client) = remote_endpoint(text, *place, findings) else {
+            continue;
+        };
+        if clients.contains(&client) {
+            let message = format!("the client {client} is listed twice");
+            findings.error(Code::Endpoint, *place, message);
+            continue;
+        }
+        clients.push(client);
+    }
+    clients
+}
+
+/// Maximum number of clients to which the server connects.
+const MAX_REVERSE: usize = 16;
 
 fn history(field: &Field<HistoryEntry>, findings: &mut Findings) -> History {
     let usual = History::default();

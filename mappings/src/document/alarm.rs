@@ -57,6 +57,13 @@ choice! {
     }
 }
 
+choice! {
+    enum AcknowledgesEntry {
+        /// The alarms of the server.
+        Alarms = "alarms",
+    }
+}
+
 /// A value or a list of values, as texts.
 #[derive(Clone, Debug)]
 pub(crate) struct ValueList(pub(crate) Vec<At<String>>);

@@ -5,11 +5,13 @@
 //!   Both are pure.
 //! - `event` and `nodes`: a condition as an event and as nodes.
 //! - `diagnostics` and `publishers`: further sources of conditions; `report`: conditions as
-//!   diagnostics of ROS; `methods`: calls of clients; `page`: conditions on the page.
+//!   diagnostics of ROS; `methods`: calls of clients; `acknowledging`: calls of the space; `page`:
+//!   conditions on the page.
 //!
 //! A single lock guards all conditions. While it is held, the current values are read and the
 //! subscriptions are called; the address space is written afterwards.
 
+mod acknowledging;
 mod condition;
 mod diagnostics;
 mod event;
@@ -42,6 +44,7 @@ use tokio::sync::Notify;
 use tracing::info;
 use uadp::Scalar;
 
+pub(crate) use self::acknowledging::description as description_of_acknowledging;
 use self::condition::{Condition, Effect, Levels, Report, Stamp};
 use self::diagnostics::Diagnostics;
 use self::event::{ConditionEvent, Identity, Kind};

@@ -80,7 +80,7 @@ impl Clients {
             .iter()
             .filter_map(|call| match &call.executed {
                 ExecutedBy::OpcUa(target) => Some(&target.access),
-                ExecutedBy::Ros(_) | ExecutedBy::Elsewhere => None,
+                ExecutedBy::Ros(_) | ExecutedBy::Acknowledging | ExecutedBy::Elsewhere => None,
             });
         let wanted: HashSet<&Access> = servers.chain(methods).chain(found).collect();
         self.open.retain(|access, _| wanted.contains(access));

@@ -5,22 +5,28 @@ use std::sync::Arc;
 
 use bridge_node::{Failure, FailureKind};
 use mappings::{SecurityPolicy, Server, ServerLimits};
-use opcua::server::{Limits, ServerBuilder};
+use opcua::server::{Limits, ServerBuilder, ServerHandle};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::door::{Door, UnknownClients};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::enrolment::{Applicant, Enrolment, Invitation};
 use plant_opcua::limits::{self, ClientLimits};
+use plant_opcua::patches;
 use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use plant_opcua::server::Security;
 use tokio::runtime::Runtime;
 use tracing::warn;
 
-use crate::identity;
+use crate::{identity, reverse};
+
+/// Returns whether programs of this host only reach a server that listens at `address`.
+pub(crate) fn is_local(described: &Server, address: SocketAddr) -> bool {
+    address.ip().is_loopback() && described.connects_to_own_host_only()
+}
 
 /// Returns the security policies that the server offers at `address`, as the mapping defines them.
 pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<Security> {
-    let policies = described.policies(address.ip().is_loopback());
+    let policies = described.policies(is_local(described, address));
     let security = policies.into_iter().map(|policy| match policy {
         SecurityPolicy::None => Security::None,
         SecurityPolicy::Basic256Sha256 => Security::Basic256Sha256,
@@ -55,6 +61,7 @@ pub(crate) fn server(
         // the client's timeout has to hold. Each call has its own deadline.
         .max_timeout_ms(0)
         .limits(within(described.limits));
+    builder.config_mut().reverse_connect_failure_delay_ms = REVERSE_PAUSE_MS;
     for security in security {
         for (name, endpoint) in security.endpoints(url.path()) {
             builder = builder.add_endpoint(name, endpoint);
@@ -147,6 +154,40 @@ pub(crate) fn stand(runtime: &Runtime, door: Standing) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Connects the server to the clients of the mapping. Each connection is tried again, 5 s after it
+/// failed or ended.
+///
+/// # Errors
+/// Returns an error if the certificates of clients are checked before the server, or if the library
+/// has no pause between two attempts.
+pub(crate) fn reverse_connect(
+    described: &Server,
+    (handle, url): (&ServerHandle, String),
+    (runtime, has_door): (&Runtime, bool),
+) -> Result<(), Failure> {
+    if described.reverse_connect.is_empty() {
+        return Ok(());
+    }
+    let refused = |why: &str| {
+        let message = format!("server.reverse_connect: {why}");
+        Err(Failure::new(FailureKind::Configuration, message))
+    };
+    if has_door {
+        return refused(
+            "the store trusts an authority, whose clients are checked where they connect; trust the \
+             certificates of these clients themselves, or let them connect",
+        );
+    }
+    if !patches::are_applied() {
+        return refused("build with `cargo xtask build`, which applies the patches");
+    }
+    for client in &described.reverse_connect {
+        let (handle, url) = (handle.clone(), url.clone());
+        drop(runtime.spawn(reverse::connect(handle, client.clone(), url)));
+    }
+    Ok(())
+}
+
 /// Renews the certificate of the server at the Global Discovery Server, as long as the server runs.
 pub(crate) fn enrol(
     runtime: &Runtime,
@@ -170,4 +211,6 @@ pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
 const MOST_HISTORY_GOES_ON: usize = 100;
 /// Largest number of histories of events in a request. Only two nodes have one.
 const MOST_EVENT_HISTORIES: usize = 10;
+/// Pause before a connection to a client is tried again, in milliseconds.
+const REVERSE_PAUSE_MS: u64 = 5_000;
 const SERVER_THREADS: usize = 2;

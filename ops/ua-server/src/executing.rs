@@ -1,4 +1,4 @@
-//! Executes Methods of other OPC UA servers for callers in the space.
+//! Executes Methods of other OPC UA servers, and acknowledges alarms, for callers in the space.
 //!
 //! Each server has a single client, however many of its Methods are mapped. A Method is offered
 //! while the server is connected and the types of its arguments are supported. No call is repeated:
@@ -24,6 +24,7 @@ pub(crate) use self::signature::node as local_node;
 
 use self::signature::Signature;
 use self::watch::{Found, News};
+use crate::alarms::{Alarms, description_of_acknowledging};
 use crate::clients::Clients;
 use crate::layout::Shape;
 use crate::value;
@@ -41,6 +42,9 @@ pub(crate) struct Executing {
     /// Events that are not reported yet: refused executions and withdrawn calls.
     events: VecDeque<PortEvent>,
     running: JoinSet<Executed>,
+    /// The calls that acknowledge alarms, as they are offered.
+    acknowledging: HashMap<TopicId, Offered>,
+    alarms: Arc<Alarms>,
     executions: HashMap<tokio::task::Id, (ExecutionId, TopicId)>,
 }
 
@@ -67,8 +71,8 @@ impl Drop for Server {
 }
 
 impl Executing {
-    /// Starts to look for the Methods of `mapping`.
-    pub(crate) fn new(mapping: &Mapping, clients: &mut Clients) -> Self {
+    /// Starts to look for the Methods of `mapping`, and offers the calls that acknowledge `alarms`.
+    pub(crate) fn new(mapping: &Mapping, clients: &mut Clients, alarms: Arc<Alarms>) -> Self {
         let (tell, heard) = mpsc::channel(MOST_NEWS);
         let mut executing = Self {
             servers: HashMap::new(),
@@ -79,6 +83,8 @@ impl Executing {
             tell,
             events: VecDeque::new(),
             running: JoinSet::new(),
+            acknowledging: HashMap::new(),
+            alarms,
             executions: HashMap::new(),
         };
         executing.reload(mapping, clients);
@@ -108,6 +114,7 @@ impl Executing {
             self.wanted.insert(call.topic, wanted);
             self.timeouts.insert(call.topic, call.timeout);
         }
+        self.offer_acknowledging(mapping);
         let is_wanted = |found: &Found| {
             let wanted = self.wanted.get(&found.wanted.topic);
             wanted.is_some_and(|wanted| Arc::ptr_eq(wanted, &found.wanted))
@@ -126,6 +133,27 @@ impl Executing {
                 }
             }
         }
+    }
+
+    /// Offers the calls of the mapping that acknowledge alarms, and withdraws the others.
+    fn offer_acknowledging(&mut self, mapping: &Mapping) {
+        let calls = mapping.calls().iter();
+        let calls = calls.filter(|call| call.executed == ExecutedBy::Acknowledging);
+        let offered = calls.map(|call| {
+            let description = description_of_acknowledging(call);
+            let open = call.open;
+            (call.topic, Offered { description, open })
+        });
+        let mut before = std::mem::replace(&mut self.acknowledging, offered.collect());
+        for (topic, offered) in &self.acknowledging {
+            let (topic, offered) = (*topic, offered.clone());
+            if before.remove(&topic).as_ref() != Some(&offered) {
+                self.events.push_back(PortEvent::Offer { topic, offered });
+            }
+        }
+        let gone = before.into_keys();
+        self.events
+            .extend(gone.map(|topic| PortEvent::Withdrawn { topic }));
     }
 
     fn watch(&self, client: Client, access: &Access, wanted: Vec<Arc<Wanted>>) -> Server {
@@ -192,13 +220,25 @@ impl Executing {
         if self.events.len() >= MOST_EXECUTIONS {
             return false;
         }
-        if let Err(refusal) = self.begin(execution) {
+        if self.acknowledging.contains_key(&execution.topic) {
+            let (execution, outcome) = (execution.id, self.acknowledge(execution));
+            self.events
+                .push_back(PortEvent::Executed { execution, outcome });
+        } else if let Err(refusal) = self.begin(execution) {
             self.events.push_back(PortEvent::Executed {
                 execution: execution.id,
                 outcome: Executed::Refused(refusal),
             });
         }
         true
+    }
+
+    /// Acknowledges an alarm, unless the caller has stopped waiting.
+    fn acknowledge(&self, execution: &Execution) -> Executed {
+        if execution.deadline <= now().monotonic {
+            return Executed::Refused(Refusal::NotExecutable);
+        }
+        self.alarms.execute(execution)
     }
 
     fn begin(&mut self, execution: &Execution) -> Result<(), Refusal> {

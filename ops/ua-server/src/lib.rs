@@ -56,6 +56,7 @@ mod programs;
 mod properties;
 mod pubsub;
 mod redundant;
+mod reverse;
 mod sks;
 mod sources;
 mod space;

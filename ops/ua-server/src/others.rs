@@ -11,6 +11,7 @@ use plant_opcua::client::Link;
 use tracing::warn;
 use ua_component::{Foreign, ForeignSkills};
 
+use crate::alarms::Alarms;
 use crate::clients::Clients;
 use crate::executing::Executing;
 use crate::finding::{Finding, Placed};
@@ -30,11 +31,15 @@ pub(crate) struct Others {
 impl Others {
     /// Connects to the servers of `mapping`, with the certificates in `pki`. Other servers are
     /// discovered with the settings for announcing this server.
-    pub(crate) fn new(mapping: &Arc<Mapping>, told: Option<&AnnounceSettings>, pki: &Path) -> Self {
+    pub(crate) fn new(
+        mapping: &Arc<Mapping>,
+        told: Option<&AnnounceSettings>,
+        (pki, alarms): (&Path, &Arc<Alarms>),
+    ) -> Self {
         let mut clients = Clients::new(mapping.server(), pki);
         let lds = told.and_then(|told| told.lds.as_deref());
         let mut others = Self {
-            executing: Executing::new(mapping, &mut clients),
+            executing: Executing::new(mapping, &mut clients, Arc::clone(alarms)),
             sources: Sources::new(mapping, &mut clients),
             skills: ForeignSkills::default(),
             finding: Finding::new(mapping, lds, told.and_then(|told| told.mdns.clone())),

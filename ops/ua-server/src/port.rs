@@ -146,7 +146,7 @@ impl ServerPort {
         setup.sks.follow(mapping)?;
         let (listener, (address, security)) = listen(&setup.pki, &setup.url, described)?;
         let port = address.port();
-        let access = users(&setup.pki, address)?;
+        let access = users(&setup.pki, endpoint::is_local(described, address))?;
         access.set_rules(access::rules(mapping, &layout));
         let pubsub = Arc::new(PubSub::new());
         let (exits, (writes, created_items, asked)) = exits(mapping, &access, (&pubsub, &role));
@@ -177,13 +177,19 @@ impl ServerPort {
         show_limits(mapping, &layout, (&handle, &manager), shown);
         let (runtime, listener) = endpoint::threads(listener)?;
         let serving = runtime.spawn(server.run_with(listener));
+        let clients = (&handle, setup.url.advertised(port));
+        endpoint::reverse_connect(described, clients, (&runtime, door.is_some()))?;
         endpoint::stand(&runtime, door)?;
         let subscriptions = Arc::clone(handle.subscriptions());
         audit(&access, &handle);
         let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
         look_at_created(&runtime, nodes.clone(), created_items);
         tell_serving(&layout, &setup.pki, (&setup.url, port));
-        let others = Others::new(mapping, setup.announce.as_ref(), setup.pki.root());
+        let others = Others::new(
+            mapping,
+            setup.announce.as_ref(),
+            (setup.pki.root(), &alarms),
+        );
         let methods = shown_calls(&nodes, mapping, (asked, &layout), &setup.pki);
         let (server, application) = told_of(described, setup.url.advertised(port), &security);
         let own = server.applicant(setup.url.urls(port));
@@ -439,6 +445,10 @@ impl Port for ServerPort {
             ("server.redundant", was.redundant != is.redundant),
             ("server.security", was.security != is.security),
             ("server.limits", was.limits != is.limits),
+            (
+                "server.reverse_connect",
+                was.reverse_connect != is.reverse_connect,
+            ),
             ("server.history.file", was.history_file != is.history_file),
         ]
         .into_iter()
@@ -603,9 +613,9 @@ fn shown_calls(
 }
 
 /// Reads the users of the server.
-fn users(pki: &Pki, address: SocketAddr) -> Result<Arc<Access>, Failure> {
+fn users(pki: &Pki, is_local: bool) -> Result<Arc<Access>, Failure> {
     let folder = pki.root().join(users::FOLDER);
-    let access = Access::new(Some(folder), address.ip().is_loopback());
+    let access = Access::new(Some(folder), is_local);
     let faulty = |error: UserFault| Failure::new(FailureKind::Configuration, error.to_string());
     access.map(Arc::new).map_err(faulty)
 }
@@ -639,7 +649,7 @@ fn listen(
     let address = listener.local_addr();
     let address = address.map_err(|error| io(error.to_string()))?;
     let security = endpoint::security(described, address);
-    if !address.ip().is_loopback() {
+    if !endpoint::is_local(described, address) {
         tell_open(url, described, &security);
     }
     Ok((listener, (address, security)))
@@ -684,7 +694,12 @@ fn core(
         configuration.methods(),
     ];
     let methods = methods.concat();
-    let values = [history::capabilities(), Configuration::values(is_announced)].concat();
+    let values = [
+        history::capabilities(),
+        crate::pubsub::capabilities(),
+        Configuration::values(is_announced),
+    ]
+    .concat();
     let values = values.into_iter();
     let mut values: Vec<(VariableId, CoreValue)> =
         values.map(|(id, value)| (id, value.into())).collect();

@@ -522,6 +522,16 @@ fn the_package_people_build_has_the_skill_messages_that_are_built_in() {
             files.add_action(&action, &text).unwrap();
             assert!(cmake.contains(&format!(" {stem}.action")), "{stem}");
         }
+        for entry in std::fs::read_dir(folder.join("srv")).unwrap() {
+            let path = entry.unwrap().path();
+            let stem = path.file_stem().unwrap().to_str().unwrap().to_owned();
+            let text = std::fs::read_to_string(&path).unwrap();
+            let service = name(&format!("ua_msgs/{stem}"));
+            files.add_service(&service, &text).unwrap();
+            assert!(cmake.contains(&format!("{stem}.srv")), "{stem}");
+            let [ours, file] = [&built_in, &files].map(|all| all.service(&service).unwrap());
+            assert_eq!(ours.md5(), file.md5(), "{service}");
+        }
         let of_ours: Vec<&TypeName> = built_in
             .names()
             .filter(|known| known.package() == "ua_msgs")

@@ -111,6 +111,6 @@ fn targets(
         .filter(move |call| call.kind == kind);
     calls.filter_map(|call| match &call.executed {
         ExecutedBy::Ros(target) => Some((call, target)),
-        ExecutedBy::OpcUa(_) | ExecutedBy::Elsewhere => None,
+        ExecutedBy::OpcUa(_) | ExecutedBy::Acknowledging | ExecutedBy::Elsewhere => None,
     })
 }

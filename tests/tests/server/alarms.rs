@@ -352,6 +352,16 @@ variables:
     origin: 0
     reports: alarms
     ros: {space: 1, topic: /cell/diagnostics, type: diagnostic_msgs/DiagnosticArray}
+calls:
+  - node: ns=2;i=91
+    name: Alarms.Acknowledge
+    origin: 0
+    acknowledges: alarms
+    ros:
+      space: 1
+      service: /cell/acknowledge
+      type: roscpp/SetLoggerLevel
+      request: {event_id: {field: logger}, comment: {field: level}}
 server:
   security: [None]
 ";
@@ -379,6 +389,24 @@ fn the_conditions_of_the_server_are_diagnostics_of_ros() {
     let high = tool.wait_for_json("the condition is an error", SOON, status(2, "false"));
     assert_eq!(high["message"], "level is 75: High");
     assert_eq!(high["values"]["severity"], "700");
+    // The request has the id of the event, and a comment. An unknown id acknowledges nothing.
+    let values = [json!("00ff"), high["values"]["event_id"].clone()]
+        .map(|event| json!({"logger": event, "level": "on my way"}).to_string());
+    let service = ["/cell/acknowledge", "roscpp/SetLoggerLevel"];
+    let values = values
+        .each_ref()
+        .map(|value| ["--value", value.as_str()])
+        .concat();
+    let mut robot = cell.rospy("ros1_call.py", &[&service[..], &values].concat());
+    eventually("both responses", SOON, || {
+        let lines = robot.json_lines();
+        let answers = lines.iter().filter(|line| line.get("value").is_some());
+        (answers.count() == 2).then_some(())
+    });
+    assert!(robot.wait_for_end(SOON).success());
+    tool.wait_for_json("the alarm is acknowledged", SOON, status(2, "true"));
+    let user = read(&cell, "ns=1;s=ua_0_2_30.alarm|ClientUserId");
+    assert_eq!(user["value"], "space 1");
     // Clients cannot write values of the server itself.
     let refused = write(&cell, "ns=2;i=90", "Double", "1");
     assert_eq!(refused, "BadNotWritable");

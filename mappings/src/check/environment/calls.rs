@@ -41,7 +41,7 @@ pub(super) fn check(
                     .help("the call is offered only while the server has the Method");
             }
         }
-        ExecutedBy::Elsewhere => {}
+        ExecutedBy::Acknowledging | ExecutedBy::Elsewhere => {}
     }
     for binding in &call.asked {
         let live = environment.spaces.get(&binding.space);

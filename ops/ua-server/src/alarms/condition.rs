@@ -376,11 +376,16 @@ impl Condition {
         Ok(())
     }
 
+    /// Returns true if an event of the condition has that id and is recent.
+    pub(crate) fn has_event(&self, event: &ByteString) -> bool {
+        self.events.contains(event)
+    }
+
     fn check(&self, event: &ByteString) -> Result<(), StatusCode> {
         if !self.state.enabled.on {
             return Err(StatusCode::BadConditionDisabled);
         }
-        if !self.events.contains(event) {
+        if !self.has_event(event) {
             return Err(StatusCode::BadEventIdUnknown);
         }
         Ok(())

@@ -118,10 +118,9 @@ fn state(identity: &Identity, condition: &Condition) -> ConditionState {
         time: value::ticks(state.event.time),
         picoseconds: 0,
     };
-    let id = state.event.id.as_ref();
     ConditionState {
         condition: identity.node.to_string(),
-        event: id.iter().map(|byte| format!("{byte:02x}")).collect(),
+        event: hexadecimal(&state.event.id),
         name: identity.name.clone(),
         severity: state.severity,
         level: state.levels.name(),
@@ -136,8 +135,14 @@ fn state(identity: &Identity, condition: &Condition) -> ConditionState {
     }
 }
 
+/// Returns an event id in hexadecimal.
+pub(super) fn hexadecimal(id: &ByteString) -> String {
+    let bytes = id.as_ref().iter();
+    bytes.map(|byte| format!("{byte:02x}")).collect()
+}
+
 /// Parses an event id in hexadecimal.
-fn bytes(text: &str) -> Option<Vec<u8>> {
+pub(super) fn bytes(text: &str) -> Option<Vec<u8>> {
     if text.len() > LONGEST_ID || !text.is_ascii() || !text.len().is_multiple_of(2) {
         return None;
     }

@@ -10,6 +10,7 @@ use uadp::Timestamp;
 
 use super::condition::State;
 use super::event::{Identity, Kind};
+use super::page;
 
 /// A variable with the conditions of the server.
 #[derive(Debug, PartialEq)]
@@ -148,6 +149,7 @@ fn put_status(block: &mut Vec<u8>, topic: TopicId, identity: &Identity, state: &
         ("severity", state.severity.to_string()),
         ("acknowledged", state.acked.on.to_string()),
         ("condition", identity.node.to_string()),
+        ("event_id", page::hexadecimal(&state.event.id)),
     ];
     put_length(&mut body, values.len());
     for (key, value) in values {

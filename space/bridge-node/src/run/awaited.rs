@@ -86,7 +86,10 @@ fn add_spaces(
     for call in mapping.calls() {
         let space = call.topic.space;
         let is_asked = match own == SpaceId::UA {
-            true => !matches!(call.executed, ExecutedBy::OpcUa(_)),
+            true => !matches!(
+                call.executed,
+                ExecutedBy::OpcUa(_) | ExecutedBy::Acknowledging
+            ),
             false => call.asked.iter().any(|binding| binding.space == own),
         };
         let is_online = matches!(received.get(&space), Some(Presence::Online));
