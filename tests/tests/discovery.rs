@@ -10,6 +10,7 @@ mod levels;
 mod presence;
 mod rules;
 mod space;
+mod through;
 
 use std::io::{Read as _, Write as _};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener, TcpStream};

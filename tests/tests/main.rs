@@ -29,6 +29,7 @@ mod loop_silence;
 mod mes;
 mod metadata;
 mod modules;
+mod moveit;
 mod mqtt;
 mod niryo;
 mod one_process;

@@ -1,6 +1,8 @@
 //! The MES with components that start, are killed and are replaced: its knowledge, which users
 //! change, and the outcome of processes.
 
+mod exchange;
+
 use std::fs;
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;

@@ -36,14 +36,14 @@ fn calls(robot: &Child, service: &str) -> Vec<Value> {
         .collect()
 }
 
-struct Line {
-    side: UaSide,
-    robot: Child,
+pub(crate) struct Line {
+    pub(crate) side: UaSide,
+    pub(crate) robot: Child,
     bridge: Child,
     _master: Child,
 }
 
-fn start(cell: &Cell) -> Line {
+pub(crate) fn start(cell: &Cell) -> Line {
     start_with(cell, MAPPING)
 }
 
@@ -65,7 +65,7 @@ fn bridge(cell: &Cell, mapping: &str) -> Child {
         .start()
 }
 
-fn cell() -> Option<Cell> {
+pub(crate) fn cell() -> Option<Cell> {
     let _there = definitions()?;
     Cell::with(&[Peer::Ros1])
 }

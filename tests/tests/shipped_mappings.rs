@@ -102,6 +102,7 @@ fn every_shipped_mapping_has_a_test_that_runs_it() {
         include_str!("assembly_line.rs"),
         include_str!("call_actionlib.rs"),
         include_str!("call_services.rs"),
+        include_str!("moveit.rs"),
         include_str!("niryo.rs"),
         include_str!("turtlebot3.rs"),
     ];

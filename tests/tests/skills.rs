@@ -83,6 +83,7 @@ mod foreign;
 mod reload;
 mod robot;
 mod values;
+mod worse;
 
 #[test]
 fn a_client_with_a_queue_sees_each_state_of_runs_that_are_over_at_once() {

@@ -1,0 +1,129 @@
+//! Skills over worse networks: lost and delayed frames, and a link that is interrupted during a run.
+
+use std::time::Duration;
+
+use skills::{
+    ClientOptions, Runs as _, SkillClient, SkillFault, SkillHandle, TypeName, Value as Told,
+};
+use system_tests::{Cell, Child, Host, Started, THERE, WIRE, Wire, program};
+use tokio::time::{Instant, sleep};
+
+use super::SOON;
+
+/// A component at the other end of a wire.
+fn there(cell: &Cell, host: &Host) -> Child {
+    let yaml = "{component: far, application_uri: 'urn:ua-bridge:system-tests:far', namespace: 9,
+        security: [None], skills: [
+          {name: Grasp, type: GraspSkillType, driver: {simulated: {duration: 5 s}}},
+          {name: Release, type: ReleaseSkillType, driver: {simulated: {duration: 50 ms}}}]}";
+    let endpoint = format!("opc.tcp://{THERE}:4850");
+    Started::new("ua-component", &program("ua-component"))
+        .args([cell.file("far.yaml", yaml)])
+        .args([
+            "--endpoint",
+            &endpoint,
+            "--lds",
+            "none",
+            "--interface",
+            WIRE,
+        ])
+        .on(host)
+        .start()
+}
+
+/// Connects to the component with a time limit for each response.
+async fn connected(within: Duration) -> SkillClient {
+    let options = ClientOptions {
+        within,
+        ..ClientOptions::default()
+    };
+    let endpoint = format!("opc.tcp://{THERE}:4850");
+    let limit = Instant::now() + SOON;
+    loop {
+        match SkillClient::connect(&endpoint, &options).await {
+            Ok(client) => return client,
+            Err(fault) => assert!(Instant::now() < limit, "{fault}"),
+        }
+    }
+}
+
+async fn one(client: &SkillClient, of: &str) -> SkillHandle {
+    let found = client.skills_of(&TypeName::own(of)).await.unwrap();
+    client.handle(&found[0])
+}
+
+fn on_this_host<T>(what: impl AsyncFnOnce() -> T) -> T {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    runtime.block_on(what())
+}
+
+#[test]
+fn runs_over_a_lossy_wire_are_late_and_each_is_run_once() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let host = cell.host(Wire {
+        loss: 0.05,
+        delay: Duration::from_millis(50),
+    });
+    let _component = there(&cell, &host);
+    on_this_host(async || {
+        let client = connected(SOON).await;
+        let release = one(&client, "ReleaseSkillType").await;
+        let mut numbers = Vec::new();
+        for _ in 0..10 {
+            let outcome = release
+                .run(Vec::<(String, Told)>::new(), SOON)
+                .await
+                .unwrap();
+            assert!(outcome.succeeded, "{outcome:?}");
+            numbers.push(outcome.run);
+        }
+        let each_once = numbers.windows(2).all(|two| two[1] == two[0] + 1);
+        assert!(each_once, "{numbers:?}");
+        client.close().await;
+    });
+}
+
+#[test]
+fn a_run_goes_on_while_the_link_is_gone_and_its_outcome_is_read_afterwards() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let host = cell.host(Wire::default());
+    let _component = there(&cell, &host);
+    on_this_host(async || {
+        // A caller that waits for its run by number gets the outcome after the link is back.
+        let client = connected(Duration::from_secs(2)).await;
+        let grasp = one(&client, "GraspSkillType").await;
+        let run = grasp.execute(Vec::new(), None).await.unwrap();
+        let gone = async {
+            host.cut();
+            sleep(Duration::from_secs(3)).await;
+            host.mend();
+        };
+        let (outcome, ()) = tokio::join!(grasp.wait(run, SOON), gone);
+        let outcome = outcome.unwrap();
+        assert_eq!((outcome.run, outcome.succeeded), (run, true), "{outcome:?}");
+        client.close().await;
+        // A caller that follows its run is told that it is lost, not that it has failed.
+        let client = connected(Duration::from_secs(2)).await;
+        let grasp = one(&client, "GraspSkillType").await;
+        let gone = async {
+            while grasp.state().await.unwrap().state.name() != "Running" {
+                sleep(Duration::from_millis(20)).await;
+            }
+            host.cut();
+            sleep(Duration::from_secs(3)).await;
+            host.mend();
+        };
+        let (lost, ()) = tokio::join!(grasp.run(Vec::new(), SOON), gone);
+        assert!(matches!(lost, Err(SkillFault::Lost(_))), "{lost:?}");
+        // The run has gone on: another session reads how it ended.
+        let later = connected(Duration::from_secs(2)).await;
+        let grasp = one(&later, "GraspSkillType").await;
+        let outcome = grasp.wait(run + 1, SOON).await.unwrap();
+        assert!(outcome.succeeded, "{outcome:?}");
+        later.close().await;
+        client.close().await;
+    });
+}
