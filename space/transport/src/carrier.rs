@@ -241,6 +241,18 @@ pub enum Capacity {
     Unknown,
 }
 
+impl Capacity {
+    /// Returns the capacity that both networks have.
+    pub(crate) fn slower(self, other: Self) -> Self {
+        match (self, other) {
+            (Self::Host(one), Self::Host(other)) => Self::Host(one.min(other)),
+            (Self::Wire(one), Self::Wire(other)) => Self::Wire(one.min(other)),
+            (Self::Host(_), slower) | (slower, Self::Host(_)) => slower,
+            (Self::Unknown, _) | (_, Self::Unknown) => Self::Unknown,
+        }
+    }
+}
+
 /// A change of the network of a carrier.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CarrierChange {
@@ -296,5 +308,29 @@ impl Carrier for Udp {
 
     fn capacity(&self) -> Capacity {
         Self::capacity(self)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_two_networks_the_slower_one_counts() {
+        let [host, wire, unknown] = [
+            Capacity::Host(4 << 20),
+            Capacity::Wire(125_000_000),
+            Capacity::Unknown,
+        ];
+        for (one, other, slower) in [
+            (host, Capacity::Host(1 << 20), Capacity::Host(1 << 20)),
+            (host, wire, wire),
+            (wire, Capacity::Wire(12_500_000), Capacity::Wire(12_500_000)),
+            (wire, unknown, unknown),
+            (host, unknown, unknown),
+        ] {
+            assert_eq!(one.slower(other), slower);
+            assert_eq!(other.slower(one), slower);
+        }
     }
 }

@@ -7,7 +7,7 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use crate::carrier::{
-    Arrival, Carrier, CarrierChange, CarrierState, Outgoing, Received, Senders, Traffic,
+    Arrival, Capacity, Carrier, CarrierChange, CarrierState, Outgoing, Received, Senders, Traffic,
 };
 use crate::udp::SendError;
 
@@ -315,6 +315,14 @@ impl Carrier for Carriers {
     fn limit(&self) -> Option<usize> {
         let members = self.members.iter();
         members.filter_map(|member| member.carrier.limit()).min()
+    }
+
+    fn capacity(&self) -> Capacity {
+        let members = self.members.iter();
+        let slowest = members
+            .map(|member| member.carrier.capacity())
+            .reduce(Capacity::slower);
+        slowest.unwrap_or(Capacity::Unknown)
     }
 
     fn arrival(&self) -> Arrival {
