@@ -361,8 +361,8 @@ fn a_redundant_bridge_takes_calls_and_refuses_values_of_services() {
     let head = "spaces: [{id: 1}]\nnamespaces: {2: urn:plant}\n";
     let calls = "calls:\n  - {node: ns=2;i=60, name: Grip, origin: 1, ros: {service: /grip, type: \
                  std_srvs/Trigger}}\n";
-    let values = "variables:\n  - {node: ns=2;i=61, name: Light, type: Boolean, origin: 0, ros: {space: 1, service: \
-                  /light, type: std_srvs/SetBool, request: {field: data}}}\n";
+    let values = "variables:\n  - {node: ns=2;i=61, name: Light, origin: 0, ros: {space: 1, call: /light, type: \
+                  std_srvs/SetBool, field: data}}\n";
     for (name, text, code) in [("calls", calls, 0), ("values", values, 78)] {
         let mapping = cell.file(&format!("{name}.yaml"), &format!("{head}{text}"));
         let mut checked = Started::new("bridge-ros1", &program("bridge-ros1"))

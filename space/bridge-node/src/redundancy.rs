@@ -140,7 +140,7 @@ calls:
   - {node: ns=5;i=60, name: Grip, origin: 2, ros: [{service: /g, type: std_srvs/Trigger}, {space: 1, service: /g, type: std_srvs/Trigger}]}
 ";
     const SERVICE: &str = "
-  - {node: ns=5;i=11, name: Light, origin: 1, ros: [{topic: /l, type: std_msgs/Bool}, {space: 2, service: /l, type: std_srvs/SetBool, request: {field: data}}]}
+  - {node: ns=5;i=11, name: Light, origin: 1, ros: {space: 2, call: /l, type: std_srvs/SetBool, field: data}}
 ";
 
     fn checked(words: &[&str], yaml: &str) -> Result<(), String> {
