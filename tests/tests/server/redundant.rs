@@ -9,7 +9,7 @@ namespaces: {2: urn:ua-bridge:system-tests}
 spaces: [{id: 2}]
 variables:
   - {node: ns=2;i=10, name: temperature, type: Double, origin: 2}
-  - {node: ns=2;i=30, name: setpoint, type: Double, origin: 0, confirm: none}
+  - {node: ns=2;i=30, name: setpoint, type: Double, origin: 0}
 server: {security: [None], redundant: [\"urn:cell:server-1\", \"urn:cell:server-2\"]}
 ";
 const ENDPOINTS: [&str; 2] = [SERVER_ENDPOINT, "opc.tcp://127.0.0.1:48499"];
@@ -95,7 +95,12 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
     eventually("the standby is active", SOON, || {
         (role(standby)? == "active").then_some(())
     });
+    let mut sequence = 1;
     eventually("its level shows it", SOON, || {
+        // A space whose writers are silent has a low level.
+        sequence += 1;
+        let value_of = key_frame(TEMPERATURE, sequence, 21.5, DataSetHeader::default());
+        group.send(&value_of);
         (value(&cell, standby, SERVICE_LEVEL)? == 255).then_some(())
     });
     assert_eq!(value(&cell, standby, TEMPERATURE_NODE), Some(json!(21.5)));
