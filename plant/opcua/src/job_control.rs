@@ -4,6 +4,7 @@
 use std::io::{Read, Write};
 use std::sync::LazyLock;
 
+use opcua::types::xml::{XmlEncodable, XmlStreamWriter, XmlType};
 use opcua::types::{
     BinaryDecodable, BinaryEncodable, Context, DateTime, EUInformation, EncodingResult,
     ExpandedMessageInfo, ExpandedNodeId, LocalizedText, RelativePath, StaticTypeLoader,
@@ -317,7 +318,7 @@ impl<T> XmlType for Nested<T> {
 impl<T: XmlEncodable> XmlEncodable for Nested<T> {
     fn encode(
         &self,
-        stream: &mut opcua::types::xml::XmlStreamWriter<&mut dyn Write>,
+        stream: &mut XmlStreamWriter<&mut dyn Write>,
         ctx: &Context<'_>,
     ) -> EncodingResult<()> {
         self.0

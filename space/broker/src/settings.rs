@@ -13,7 +13,7 @@ use rustls::pki_types::{CertificateDer, InvalidDnsNameError, PrivateKeyDer, Serv
 use rustls::{ClientConfig, RootCertStore, crypto};
 
 use crate::reports::Reports;
-use crate::topics::{self, Address, MessageType, UADP};
+use crate::topics::{self, Address, TopicMessageType, UADP};
 
 /// The program that uses a broker.
 #[derive(Debug, Clone)]
@@ -101,7 +101,7 @@ impl BrokerSettings {
 fn will(broker: &Broker, identity: &Identity) -> Option<Will> {
     let publisher = identity.publisher.filter(|of| broker.will && *of != 0)?;
     let address = Address {
-        kind: MessageType::Status,
+        kind: TopicMessageType::Status,
         publisher,
         group: None,
         writer: None,
