@@ -41,3 +41,14 @@ fn services_respond_as_the_page_of_conformance_says() {
     let page = fs::read_to_string(page).unwrap();
     assert!(page.contains(&table), "{page} has to contain\n{table}");
 }
+
+#[test]
+fn a_durable_subscription_keeps_its_values_for_a_client_that_comes_back() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = serving(&cell, VARIABLES);
+    let lines = cell.asyncua_once("opcua_durable.py", &[SERVER_ENDPOINT]);
+    let statuses = json!({"plain": "BadSubscriptionIdInvalid", "durable": "Good"});
+    assert_eq!(lines, [statuses, json!({"values": [0.0, 1.0, 2.0]})]);
+}

@@ -1,0 +1,63 @@
+"""Leaves a server with two subscriptions, of which one is durable, and comes back when the other
+one has ended. It prints what another session gets of both.
+"""
+
+import argparse
+import asyncio
+
+from asyncua import Client, ua
+
+import lifetime
+from opcua_services import Server, durable, statuses
+
+COUNT = ua.NodeId(ua.ObjectIds.Server_ServerDiagnostics_ServerDiagnosticsSummary_CurrentSubscriptionCount)
+# The lifetime is three publishing intervals.
+SHORT = {
+    "RequestedPublishingInterval": 20.0,
+    "RequestedMaxKeepAliveCount": 1,
+    "RequestedLifetimeCount": 3,
+    "PublishingEnabled": True,
+}
+
+
+async def transferred(server, subscription):
+    fields = {"SubscriptionIds": [subscription], "SendInitialValues": False}
+    return statuses(await server.one("TransferSubscriptions", **fields))
+
+
+async def run(endpoint):
+    async with Client(endpoint, timeout=20) as client:
+        server = Server(client, None)
+        (await server.write({"value": 0.0})).check()
+        leaving = Client(endpoint, timeout=20)
+        await leaving.connect()
+        gone = Server(leaving, None)
+        plain, kept = await gone.subscribed(**SHORT), await gone.subscribed(**SHORT)
+        (await durable(gone, kept, 1)).StatusCode.check()
+        for subscription in (plain, kept):
+            (await gone.create({"subscription": subscription})).StatusCode.check()
+        await leaving.uaclient.close_session(False)
+        leaving.uaclient.disconnect_socket()
+        for value in (1.0, 2.0):
+            (await server.write({"value": value})).check()
+        while await client.get_node(COUNT).read_value() > 1:
+            await asyncio.sleep(0.02)
+        lifetime.say(plain=await transferred(server, plain), durable=await transferred(server, kept))
+        found = []
+        while len(found) < 3:
+            message = (await server.ask("Publish")).NotificationMessage
+            for data in message.NotificationData or []:
+                found += [item.Value.Value.Value for item in data.MonitoredItems]
+        lifetime.say(values=found)
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("endpoint")
+    parser.add_argument("--limit", type=float, default=60.0)
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    asyncio.run(run(args.endpoint))
+
+
+main()
