@@ -10,6 +10,7 @@ use std::time::Duration;
 use bridge_core::{CallCounters, Counters, Delays, Hop, Reason, Router};
 use mappings::{SpaceId, Variable};
 use serde::Serialize;
+use uadp::Timestamp;
 
 use self::carriers::CarrierStatus;
 pub(crate) use self::redundancy::RedundancyStatus;
