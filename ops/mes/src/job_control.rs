@@ -5,7 +5,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use plant_opcua::job_control::{
-    JobOrder, JobOrderAndState, JobResponse, NAMESPACE, NODESET, Parameter, State, Types,
+    JobOrder, JobOrderAndState, JobResponse, NAMESPACE, NODESET, OptionalArray, Parameter, State,
+    Types,
 };
 use plant_opcua::server::{
     IdRange, Instance, InstanceError, InstanceSpec, MethodRequest, Refusal, Server, ServerBuilder,
@@ -299,7 +300,7 @@ fn response(order: &Order) -> JobResponse {
         start: progress.map(|progress| time(progress.started_ms)),
         end: progress.and_then(|progress| progress.ended_ms).map(time),
         states: Some(vec![state(order)]),
-        data: Some(data),
+        data: Some(OptionalArray(data)),
         ..JobResponse::default()
     }
 }

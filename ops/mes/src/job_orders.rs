@@ -283,18 +283,18 @@ fn process_of(order: &JobOrder, runs: &dyn JobRuns) -> Result<String, Status> {
     // Nothing that a client requires is left out without a word.
     let is_empty = |count: Option<usize>| count.unwrap_or_default() == 0;
     let counts = [
-        order.parameters.as_ref().map(Vec::len),
-        order.personnel.as_ref().map(Vec::len),
-        order.equipment.as_ref().map(Vec::len),
-        order.assets.as_ref().map(Vec::len),
-        order.material.as_ref().map(Vec::len),
+        order.parameters.as_ref().map(|array| array.0.len()),
+        order.personnel.as_ref().map(|array| array.0.len()),
+        order.equipment.as_ref().map(|array| array.0.len()),
+        order.assets.as_ref().map(|array| array.0.len()),
+        order.material.as_ref().map(|array| array.0.len()),
     ];
     if !counts.into_iter().all(is_empty) || order.start.is_some() {
         return Err(Status::UnableToAccept);
     }
-    let masters = order.work_masters.iter().flatten();
+    let masters = order.work_masters.iter().flat_map(|array| &array.0);
     let mut known = masters.filter(|master| {
-        let parameters = master.parameters.as_ref().map_or(0, Vec::len);
+        let parameters = master.parameters.as_ref().map_or(0, |array| array.0.len());
         parameters == 0 && runs.is_process(master.id.as_ref())
     });
     let process = known.next().map(|master| master.id.as_ref().to_owned());
@@ -309,7 +309,7 @@ const LONGEST_ID: usize = 256;
 mod tests {
     use std::sync::Mutex;
 
-    use plant_opcua::job_control::{Parameter, WorkMaster};
+    use plant_opcua::job_control::{OptionalArray, Parameter, WorkMaster};
 
     use super::*;
 
@@ -357,7 +357,7 @@ mod tests {
         };
         JobOrder {
             id: id.into(),
-            work_masters: Some(vec![master]),
+            work_masters: Some(OptionalArray(vec![master])),
             ..JobOrder::default()
         }
     }
@@ -468,12 +468,12 @@ mod tests {
         let mut orders = Orders::default();
         let parameter = Parameter::default();
         let with = JobOrder {
-            parameters: Some(vec![parameter]),
+            parameters: Some(OptionalArray(vec![parameter])),
             ..job_order("one", "urn:p")
         };
         assert_eq!(orders.store(with, &runs), Status::UnableToAccept);
         let empty = JobOrder {
-            parameters: Some(Vec::new()),
+            parameters: Some(OptionalArray(Vec::new())),
             ..job_order("one", "urn:p")
         };
         assert_eq!(orders.store(empty, &runs), Status::Good);

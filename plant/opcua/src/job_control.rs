@@ -68,13 +68,13 @@ structures! {
         value: Variant,
         /// The description.
         #[opcua(optional)]
-        description: Option<Vec<LocalizedText>>,
+        description: Option<OptionalArray<LocalizedText>>,
         /// The unit of the value.
         #[opcua(optional)]
         units: Option<EUInformation>,
         /// The properties of the property.
         #[opcua(optional)]
-        parts: Option<Nested<Property>>,
+        parts: Option<OptionalArray<Property>>,
     }
     /// ISA95ParameterDataType: a named value.
     Parameter = (3003_u32, 5005_u32) {
@@ -84,13 +84,13 @@ structures! {
         value: Variant,
         /// The description.
         #[opcua(optional)]
-        description: Option<Vec<LocalizedText>>,
+        description: Option<OptionalArray<LocalizedText>>,
         /// The unit of the value.
         #[opcua(optional)]
         units: Option<EUInformation>,
         /// The parameters of the parameter.
         #[opcua(optional)]
-        parts: Option<Nested<Parameter>>,
+        parts: Option<OptionalArray<Parameter>>,
     }
     /// ISA95EquipmentDataType: required or used equipment.
     Equipment = (3005_u32, 5008_u32) {
@@ -98,7 +98,7 @@ structures! {
         id: UAString,
         /// The description.
         #[opcua(optional)]
-        description: Option<Vec<LocalizedText>>,
+        description: Option<OptionalArray<LocalizedText>>,
         /// The use of the equipment.
         #[opcua(optional)]
         usage: Option<UAString>,
@@ -110,7 +110,7 @@ structures! {
         units: Option<EUInformation>,
         /// The properties.
         #[opcua(optional)]
-        properties: Option<Vec<Property>>,
+        properties: Option<OptionalArray<Property>>,
     }
     /// ISA95StateDataType: a state of a job.
     State = (3006_u32, 5029_u32) {
@@ -130,7 +130,7 @@ structures! {
         description: Option<LocalizedText>,
         /// The parameters.
         #[opcua(optional)]
-        parameters: Option<Vec<Parameter>>,
+        parameters: Option<OptionalArray<Parameter>>,
     }
     /// ISA95JobOrderDataType: a job order.
     JobOrder = (3008_u32, 5014_u32) {
@@ -138,10 +138,10 @@ structures! {
         id: UAString,
         /// The description.
         #[opcua(optional)]
-        description: Option<Vec<LocalizedText>>,
+        description: Option<OptionalArray<LocalizedText>>,
         /// The possible work.
         #[opcua(optional)]
-        work_masters: Option<Vec<WorkMaster>>,
+        work_masters: Option<OptionalArray<WorkMaster>>,
         /// The proposed start.
         #[opcua(optional)]
         start: Option<DateTime>,
@@ -153,19 +153,19 @@ structures! {
         priority: Option<i16>,
         /// The parameters.
         #[opcua(optional)]
-        parameters: Option<Vec<Parameter>>,
+        parameters: Option<OptionalArray<Parameter>>,
         /// The required persons.
         #[opcua(optional)]
-        personnel: Option<Vec<Personnel>>,
+        personnel: Option<OptionalArray<Personnel>>,
         /// The required equipment.
         #[opcua(optional)]
-        equipment: Option<Vec<Equipment>>,
+        equipment: Option<OptionalArray<Equipment>>,
         /// The required assets.
         #[opcua(optional)]
-        assets: Option<Vec<Asset>>,
+        assets: Option<OptionalArray<Asset>>,
         /// The required material.
         #[opcua(optional)]
-        material: Option<Vec<Material>>,
+        material: Option<OptionalArray<Material>>,
     }
     /// ISA95MaterialDataType: required or used material.
     Material = (3010_u32, 5017_u32) {
@@ -183,7 +183,7 @@ structures! {
         sublot: Option<UAString>,
         /// The description.
         #[opcua(optional)]
-        description: Option<Vec<LocalizedText>>,
+        description: Option<OptionalArray<LocalizedText>>,
         /// The use of the material.
         #[opcua(optional)]
         usage: Option<UAString>,
@@ -195,7 +195,7 @@ structures! {
         units: Option<EUInformation>,
         /// The properties.
         #[opcua(optional)]
-        properties: Option<Vec<Property>>,
+        properties: Option<OptionalArray<Property>>,
     }
     /// ISA95PersonnelDataType: required or working persons.
     Personnel = (3011_u32, 5020_u32) {
@@ -203,7 +203,7 @@ structures! {
         id: UAString,
         /// The description.
         #[opcua(optional)]
-        description: Option<Vec<LocalizedText>>,
+        description: Option<OptionalArray<LocalizedText>>,
         /// The task of the persons.
         #[opcua(optional)]
         usage: Option<UAString>,
@@ -215,7 +215,7 @@ structures! {
         units: Option<EUInformation>,
         /// The properties.
         #[opcua(optional)]
-        properties: Option<Vec<Property>>,
+        properties: Option<OptionalArray<Property>>,
     }
     /// ISA95PhysicalAssetDataType: a required or used asset.
     Asset = (3012_u32, 5023_u32) {
@@ -223,7 +223,7 @@ structures! {
         id: UAString,
         /// The description.
         #[opcua(optional)]
-        description: Option<Vec<LocalizedText>>,
+        description: Option<OptionalArray<LocalizedText>>,
         /// The use of the asset.
         #[opcua(optional)]
         usage: Option<UAString>,
@@ -235,7 +235,7 @@ structures! {
         units: Option<EUInformation>,
         /// The properties.
         #[opcua(optional)]
-        properties: Option<Vec<Property>>,
+        properties: Option<OptionalArray<Property>>,
     }
     /// ISA95JobResponseDataType: the execution of a job order.
     JobResponse = (3013_u32, 5026_u32) {
@@ -256,19 +256,19 @@ structures! {
         states: Option<Vec<State>>,
         /// The results.
         #[opcua(optional)]
-        data: Option<Vec<Parameter>>,
+        data: Option<OptionalArray<Parameter>>,
         /// The persons.
         #[opcua(optional)]
-        personnel: Option<Vec<Personnel>>,
+        personnel: Option<OptionalArray<Personnel>>,
         /// The equipment.
         #[opcua(optional)]
-        equipment: Option<Vec<Equipment>>,
+        equipment: Option<OptionalArray<Equipment>>,
         /// The assets.
         #[opcua(optional)]
-        assets: Option<Vec<Asset>>,
+        assets: Option<OptionalArray<Asset>>,
         /// The material.
         #[opcua(optional)]
-        material: Option<Vec<Material>>,
+        material: Option<OptionalArray<Material>>,
     }
     /// ISA95JobOrderAndStateDataType: a job order with its states.
     JobOrderAndState = (3015_u32, 5032_u32) {
@@ -279,11 +279,11 @@ structures! {
     }
 }
 
-/// Structures inside a structure of the same type. Their depth is limited when they are decoded.
+/// An array that is an optional field. The depth of arrays in arrays is limited when they are decoded.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Nested<T>(pub Vec<T>);
+pub struct OptionalArray<T>(pub Vec<T>);
 
-impl<T: BinaryEncodable> BinaryEncodable for Nested<T> {
+impl<T: BinaryEncodable> BinaryEncodable for OptionalArray<T> {
     fn byte_len(&self, ctx: &Context<'_>) -> usize {
         let parts = self.0.iter().map(|part| part.byte_len(ctx));
         parts.fold(4, usize::saturating_add)
@@ -297,7 +297,7 @@ impl<T: BinaryEncodable> BinaryEncodable for Nested<T> {
     }
 }
 
-impl<T: BinaryDecodable> BinaryDecodable for Nested<T> {
+impl<T: BinaryDecodable> BinaryDecodable for OptionalArray<T> {
     fn decode<S: Read + ?Sized>(stream: &mut S, ctx: &Context<'_>) -> EncodingResult<Self> {
         let _depth = ctx.options().depth_lock()?;
         let parts: Option<Vec<T>> = BinaryDecodable::decode(stream, ctx)?;
@@ -305,17 +305,17 @@ impl<T: BinaryDecodable> BinaryDecodable for Nested<T> {
     }
 }
 
-impl<T> UaNullable for Nested<T> {
+impl<T> UaNullable for OptionalArray<T> {
     fn is_ua_null(&self) -> bool {
         self.0.is_empty()
     }
 }
 
-impl<T> XmlType for Nested<T> {
+impl<T> XmlType for OptionalArray<T> {
     const TAG: &'static str = "ListOfExtensionObject";
 }
 
-impl<T: XmlEncodable> XmlEncodable for Nested<T> {
+impl<T: XmlEncodable> XmlEncodable for OptionalArray<T> {
     fn encode(
         &self,
         stream: &mut XmlStreamWriter<&mut dyn Write>,
@@ -355,7 +355,7 @@ mod tests {
         };
         let order = JobOrder {
             id: "one".into(),
-            work_masters: Some(vec![master]),
+            work_masters: Some(OptionalArray(vec![master])),
             priority: Some(3),
             ..JobOrder::default()
         };
@@ -373,7 +373,7 @@ mod tests {
     fn parameters_are_not_decoded_to_any_depth() {
         let nested = |depth: usize| {
             (0..depth).fold(Parameter::default(), |inner, _| Parameter {
-                parts: Some(Nested(vec![inner])),
+                parts: Some(OptionalArray(vec![inner])),
                 ..Parameter::default()
             })
         };
