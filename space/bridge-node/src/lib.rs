@@ -49,8 +49,8 @@ pub use bridge_core::{
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};
-pub use cell::{ProgramSet, SharedProgram, check_mapping, run_together};
 pub use carrier::carrier_rules;
+pub use cell::{ProgramSet, SharedProgram, check_mapping, run_together};
 pub use clock::{now, timestamp};
 pub use definitions::Definitions;
 pub use executing::{Executing, ExecutorGraph};

@@ -339,7 +339,10 @@ fn a_confirmation_goes_back_to_the_sender_of_the_command() {
         [UDP]
     );
     let of_other = action(ActionKind::Response, (2, 2, 21), 0, None);
-    assert_eq!(targets(&routes.judge(&of_other, path(MQTT, 1), now)), NOWHERE);
+    assert_eq!(
+        targets(&routes.judge(&of_other, path(MQTT, 1), now)),
+        NOWHERE
+    );
 }
 
 #[test]
