@@ -425,7 +425,8 @@ impl<'a> Reading<'a> {
     }
 
     fn note(&mut self, map: &NamedOrBlankNode, finding: &str) {
-        self.findings.insert(format!("triples map {map}: {finding}"));
+        self.findings
+            .insert(format!("triples map {map}: {finding}"));
     }
 
     /// Notes the properties of RML that are ignored here.

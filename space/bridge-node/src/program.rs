@@ -336,8 +336,12 @@ async fn prepare<P: Program>(
     } = changes.borrow().clone();
     log_start::<P>(arguments, own, about.hash());
     let hub = host.hub(several);
-    let (carrier, group) =
-        carrier::open((P::NAME, own), (arguments, &mapping), changes, (several, hub))?;
+    let (carrier, group) = carrier::open(
+        (P::NAME, own),
+        (arguments, &mapping),
+        changes,
+        (several, hub),
+    )?;
     let settings = Settings {
         own,
         local: P::LOCAL,

@@ -213,8 +213,8 @@ fn constant(term: &Term, role: &str) -> Result<TermMap, String> {
 }
 
 fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, String> {
-    let expr =
-        parse(written, namespaces).map_err(|problem| format!("the reference `{written}`: {problem}"))?;
+    let expr = parse(written, namespaces)
+        .map_err(|problem| format!("the reference `{written}`: {problem}"))?;
     Ok(Expression {
         parts: vec![TemplatePart::Value(expr)],
         is_template: false,
