@@ -45,7 +45,7 @@ pub(crate) enum PeopleVerb {
         folders: Folders,
     },
     /// List the certificate requests and the valid invitations
-    SigningRequests {
+    Requests {
         /// Print a JSON line for each
         #[arg(long)]
         json: bool,
