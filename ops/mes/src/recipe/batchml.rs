@@ -498,7 +498,7 @@ impl<'d> Reading<'d> {
         let (id, at) = (text_of(step, "ID"), step.range().start);
         let need = self.need_of(element, block_id)?;
         let node = parts.flow.nodes.len();
-        let parameters = self.parameters(element, node, parts);
+        let parameters = self.recipe_parameters(element, node, parts);
         let description = text_of(step, "Description");
         let name = if description.is_empty() {
             id
@@ -567,7 +567,7 @@ impl<'d> Reading<'d> {
     }
 
     /// Reads the parameters of a recipe element. `node` is the number that its node gets.
-    fn parameters(
+    fn recipe_parameters(
         &mut self,
         element: Node<'d, 'd>,
         node: usize,

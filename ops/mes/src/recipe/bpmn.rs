@@ -225,7 +225,7 @@ impl<'d> Reading<'d> {
             );
             return None;
         };
-        let given = self.parameters((task, name), node, parts);
+        let given = self.task_parameters((task, name), node, parts);
         self.left_out(task);
         Some(Step {
             name: name.to_owned(),
@@ -236,7 +236,7 @@ impl<'d> Reading<'d> {
     }
 
     /// Reads the parameters of a task.
-    fn parameters(
+    fn task_parameters(
         &mut self,
         (task, name): (Node<'d, 'd>, &str),
         node: usize,
