@@ -129,7 +129,8 @@ impl Values {
     /// Returns whether nothing of the topic may be sent at the moment.
     pub(super) fn is_withheld(&self, topic: TopicId) -> bool {
         let (_, namespace, _) = topic.triple();
-        topic.space == self.settings.own && self.claims.withholds(namespace)
+        let is_elsewhere = self.part.as_ref().is_some_and(|part| !part.has(namespace));
+        topic.space == self.settings.own && (self.claims.withholds(namespace) || is_elsewhere)
     }
 
     /// Keeps the waiting items of a topic while it is unknown whether the namespace is free, or
