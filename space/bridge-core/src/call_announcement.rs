@@ -639,7 +639,8 @@ mod tests {
         )
         .unwrap();
         let mut bytes = Vec::new();
-        announcement.write((3, 9), &mut bytes);
+        // A redundant bridge has another ActionTargetId in each term.
+        announcement.write((3, 4712), &mut bytes);
         let message = NetworkMessage::decode(&bytes).unwrap();
         let announced = Announcement::decode(&message).unwrap();
         assert_eq!(announced.sequence_number, 3);
@@ -649,7 +650,7 @@ mod tests {
         assert_eq!(action.writer_id, 105);
         let (named, name) = crate::split_name(action.name().unwrap()).unwrap();
         assert_eq!(named, topic);
-        assert_eq!(read(&action, name), Ok((description, 4711)));
+        assert_eq!(read(&action, name), Ok((description, 4712)));
     }
 
     #[test]
@@ -719,7 +720,7 @@ mod tests {
         let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
         let announcement = CallAnnouncement::new(topic, said, None, utc).unwrap();
         let mut bytes = Vec::new();
-        announcement.write((3, 9), &mut bytes);
+        announcement.write((3, LASTING_TARGET), &mut bytes);
         let message = NetworkMessage::decode(&bytes).unwrap();
         let Announced::ActionMetaData(action) = Announcement::decode(&message).unwrap().announced
         else {
