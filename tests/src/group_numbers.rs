@@ -24,7 +24,7 @@ impl GroupNumbers {
     pub fn of(triple: Triple, interface: Ipv4Addr) -> Self {
         let accepted = Arc::new(Mutex::new(Vec::new()));
         let ends = Arc::new(AtomicBool::new(false));
-        let socket = UadpSocket::join_on(interface);
+        let socket = UadpSocket::join_on(interface).of_one_interface();
         let (values, over) = (Arc::clone(&accepted), Arc::clone(&ends));
         let thread = thread::spawn(move || {
             let mut last = None;

@@ -41,6 +41,17 @@ impl UadpSocket {
         Self(socket)
     }
 
+    /// Receives only from the own interface. Without this, a socket also receives the group from
+    /// other interfaces with members on this host.
+    ///
+    /// # Panics
+    /// Panics if the option cannot be set.
+    #[must_use]
+    pub fn of_one_interface(self) -> Self {
+        SockRef::from(&self.0).set_multicast_all_v4(false).unwrap();
+        self
+    }
+
     /// Sends a datagram to the group.
     ///
     /// # Panics
