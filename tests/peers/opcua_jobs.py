@@ -7,6 +7,7 @@ The last line has the results of the first job order.
 """
 
 import asyncio
+import dataclasses
 import sys
 
 from asyncua import Client, ua
@@ -21,9 +22,9 @@ def order(name, process):
     master = ua.ISA95WorkMasterDataType()
     master.ID, master.Description, master.Parameters = process, None, None
     made = ua.ISA95JobOrderDataType()
-    for field in list(vars(made)):
-        if field != "Encoding":
-            setattr(made, field, None)
+    for field in dataclasses.fields(made):
+        if field.name != "Encoding":
+            setattr(made, field.name, None)
     made.JobOrderID, made.WorkMasterID = name, [master]
     return made
 

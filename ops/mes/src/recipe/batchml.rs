@@ -221,6 +221,7 @@ impl<'d> Reading<'d> {
         parts: &mut RecipeParts<'d>,
         open: &mut Vec<Node<'d, 'd>>,
     ) -> Option<(Places<'d>, BTreeMap<usize, Node<'d, 'd>>)> {
+        let mut is_whole = true;
         let mut places: Places<'d> = BTreeMap::new();
         let mut conditions: BTreeMap<usize, Node<'d, 'd>> = BTreeMap::new();
         for step in children(logic, "Step") {
@@ -233,7 +234,11 @@ impl<'d> Reading<'d> {
                     "Description",
                 ],
             );
-            let ends = self.step(step, parent, parts, open)?;
+            // The other steps have findings too.
+            let Some(ends) = self.step(step, parent, parts, open) else {
+                is_whole = false;
+                continue;
+            };
             if places.insert(("Step", text_of(step, "ID")), ends).is_some() {
                 self.error(
                     step,
@@ -272,7 +277,7 @@ impl<'d> Reading<'d> {
             let node = parts.flow.node(link.range().start, id, kind);
             places.insert(("Link", id), (node, node));
         }
-        Some((places, conditions))
+        is_whole.then_some((places, conditions))
     }
 
     /// Adds the flows between the nodes of a procedure logic.
