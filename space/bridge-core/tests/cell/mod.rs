@@ -104,7 +104,9 @@ impl Program {
 fn instance(address: SocketAddr) -> [u8; 16] {
     // Requests are distinguished by the first bytes, and heartbeats by the last bytes.
     let [low, high] = address.port().to_le_bytes();
-    [low, high, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, low, high]
+    // The ActionTargetId is the exclusive or of all pairs.
+    let [last, end] = [low, high].map(|byte| byte.rotate_left(3));
+    [low, high, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, last, end]
 }
 
 /// Creates a program that writes a single namespace of space 0.
