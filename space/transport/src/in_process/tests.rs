@@ -170,7 +170,7 @@ fn a_message_that_the_network_refuses_reaches_nobody() {
 
 #[test]
 fn a_member_that_does_not_read_loses_its_own_messages_only_and_they_are_counted() {
-    let ([mut one, mut two], mut stranger, _) = two_and_a_stranger();
+    let ([mut one, mut two], stranger, _) = two_and_a_stranger();
     let large = vec![7; 60_000];
     let fit = MOST_BYTES / large.len();
     for _ in 0..fit + 3 {
