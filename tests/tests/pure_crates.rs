@@ -361,7 +361,11 @@ const NAMES_OF_UA_BRIDGE: [(&str, &[&str]); 6] = [
 fn only_ua_bridge_depends_on_the_programs_that_it_acts_as() {
     let all = NAMES_OF_UA_BRIDGE.map(|(name, _)| name);
     for (package, _) in NAMES_OF_UA_BRIDGE {
-        does_not_reach(package, &["bridge-ros1", "bridge-ros2"]);
+        does_not_reach(package, &["bridge-ros1"]);
+        // `ua-space init` reads the graph of DDS with the library of the bridge.
+        if package != "ua-space" {
+            does_not_reach(package, &["bridge-ros2"]);
+        }
     }
     for package in ["bridge-ros1", "bridge-ros2", "demo"] {
         does_not_reach(package, &all);
