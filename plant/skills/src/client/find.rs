@@ -6,7 +6,7 @@ use futures_util::{StreamExt, TryStreamExt, stream};
 use plant_opcua::client::{Browse, Client};
 use plant_opcua::types::{
     AttributeId, EUInformation, NodeClass, NodeClassMask, NodeId, ObjectId, ObjectTypeId,
-    QualifiedName, Range, ReferenceDescription, Variant,
+    QualifiedName, Range, ReferenceDescription, ReferenceTypeId, VariableId, Variant,
 };
 
 use super::choice::ToolState;
@@ -255,7 +255,17 @@ async fn names(client: &Client, nodes: &[NodeId]) -> Result<Vec<Option<TypeName>
         .read_attributes(&what)
         .await
         .map_err(|error| lost(&error))?;
-    let namespaces = client.namespaces();
+    let mut namespaces = client.namespaces();
+    let index_of = |value: &Option<Variant>| match value {
+        Some(Variant::QualifiedName(name)) => usize::from(name.namespace_index),
+        _ => 0,
+    };
+    let last = values.iter().map(|value| index_of(&value.value)).max();
+    if last.is_some_and(|last| last >= namespaces.len()) {
+        // A station adds the namespaces of components that come.
+        let all: NodeId = VariableId::Server_NamespaceArray.into();
+        namespaces = texts(value(client, &all).await?);
+    }
     let name = |value: Option<Variant>| match value {
         Some(Variant::QualifiedName(name)) => Some(TypeName {
             namespace: namespaces.get(usize::from(name.namespace_index))?.clone(),
@@ -448,11 +458,16 @@ fn behind(above: &[(NodeId, String)]) -> Option<&NodeId> {
 
 /// Reads the ApplicationUri of a server that a station shows.
 async fn shown_uri(client: &Client, node: &NodeId) -> Result<Option<String>, SkillFault> {
-    let path = [QualifiedName::new(1, "ApplicationUri")];
-    let Ok(property) = client.translate(node, &path).await else {
+    let properties = Browse::of(ReferenceTypeId::HasProperty);
+    let properties = client.browse(node, properties).await;
+    let properties = properties.map_err(|error| lost(&error))?;
+    // Each station has this property in a namespace of its own.
+    let mut properties = properties.iter();
+    let Some(property) = properties.find(|one| one.browse_name.name.as_ref() == "ApplicationUri")
+    else {
         return Ok(None);
     };
-    let value = value(client, &property).await?;
+    let value = value(client, &property.node_id.node_id).await?;
     Ok(value.and_then(|value| value.as_str().map(str::to_owned)))
 }
 

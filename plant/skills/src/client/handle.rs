@@ -389,6 +389,47 @@ impl SkillHandle {
         }
     }
 
+    /// Returns whether the component has to be asked for the ends of runs: the values that a station
+    /// repeats may be older than the run.
+    fn asks_component(&self) -> bool {
+        self.found.behind.is_some() && self.found.nodes.get("ReadOutcome").is_some()
+    }
+
+    /// Waits for the end of a run that this client has started.
+    async fn end_of(&self, run: u32) -> Result<Outcome, SkillFault> {
+        loop {
+            let state = self.ended().await?;
+            if !self.asks_component() || run == 0 {
+                return self.outcome(run, state).await;
+            }
+            if let Some(outcome) = self.outcome_of(run).await? {
+                return Ok(outcome);
+            }
+            tokio::time::sleep(PUBLISHING).await;
+        }
+    }
+
+    /// Waits until no run is in progress.
+    async fn over(&self) -> Result<(), SkillFault> {
+        loop {
+            if !self.asks_component() {
+                let state = self.state().await?.state;
+                if !matches!(state, State::Ready | State::Halted) {
+                    self.ended().await?;
+                }
+                return Ok(());
+            }
+            match self.outcome_of(0).await {
+                Ok(Some(_)) => return Ok(()),
+                Ok(None) => {}
+                // There is no run.
+                Err(SkillFault::Refused { .. }) => return Ok(()),
+                Err(fault) => return Err(fault),
+            }
+            tokio::time::sleep(PUBLISHING).await;
+        }
+    }
+
     pub(super) async fn outcome(&self, run: u32, state: State) -> Result<Outcome, SkillFault> {
         let paths = [
             "FinalResultData/Succeeded",
@@ -490,15 +531,19 @@ impl Runs for SkillHandle {
         within: Duration,
     ) -> Result<Outcome, SkillFault> {
         let run = self.execute(parameters, None).await?;
-        let ended = tokio::time::timeout(within, self.ended()).await;
-        let Ok(state) = ended else {
+        let ended = tokio::time::timeout(within, self.end_of(run)).await;
+        let Ok(ended) = ended else {
             self.halt().await?;
-            return match self.outcome(run, State::Halted).await {
-                Ok(outcome) if outcome.unknown => Err(SkillFault::NotHalted(outcome.message)),
-                Ok(_) | Err(_) => Err(SkillFault::TimedOut(within)),
+            let outcome = match self.asks_component() && run != 0 {
+                true => self.outcome_of(run).await.ok().flatten(),
+                false => self.outcome(run, State::Halted).await.ok(),
+            };
+            return match outcome {
+                Some(outcome) if outcome.unknown => Err(SkillFault::NotHalted(outcome.message)),
+                Some(_) | None => Err(SkillFault::TimedOut(within)),
             };
         };
-        self.outcome(run, state?).await
+        ended
     }
 
     async fn halt(&self) -> Result<(), SkillFault> {
@@ -510,15 +555,9 @@ impl Runs for SkillHandle {
             .call(&self.found.nodes.skill, node, Vec::new())
             .await;
         let Err(error) = halted else {
-            if matches!(self.state().await?.state, State::Ready | State::Halted) {
-                return Ok(());
-            }
-            // The work of the skill has not ended.
-            let ended = tokio::time::timeout(HALTS_WITHIN, self.ended()).await;
-            return match ended {
-                Ok(ended) => ended.map(drop),
-                Err(_) => Err(goes_on(&self.name())),
-            };
+            // The work of the skill may not have ended.
+            let over = tokio::time::timeout(HALTS_WITHIN, self.over()).await;
+            return over.unwrap_or_else(|_| Err(goes_on(&self.name())));
         };
         // The skill may be Halted already, which is the wanted state.
         match &error {
