@@ -645,7 +645,7 @@ impl Router {
     }
 
     fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
-        let header = super::Values::action_header(now);
+        let header = self.values.action_header(now);
         loop {
             let calls = self.calls.as_mut()?;
             if let Some(news) = calls.news.pop_front() {

@@ -63,13 +63,17 @@ impl Values {
         self.relay.is_some() && self.topics.at(at).is_some_and(is_command)
     }
 
-    /// Returns the headers of a request or a response. They contain the time of sending, because
-    /// another program may forward the message to a broker, which may deliver it late.
-    pub(super) fn action_header(now: Now) -> NetworkHeader<'static> {
-        NetworkHeader {
-            timestamp: Some(now.utc.time),
-            picoseconds: Some(now.utc.picoseconds),
-            ..NetworkHeader::default()
+    /// Returns the headers of a request or a response. Over a broker they contain the time of
+    /// sending. On UDP they do not: the chunks of a repetition fill in lost chunks of the first
+    /// transmission, so both must be equal.
+    pub(super) fn action_header(&self, now: Now) -> NetworkHeader<'static> {
+        match self.relay {
+            None => NetworkHeader::default(),
+            Some(_) => NetworkHeader {
+                timestamp: Some(now.utc.time),
+                picoseconds: Some(now.utc.picoseconds),
+                ..NetworkHeader::default()
+            },
         }
     }
 

@@ -171,7 +171,7 @@ impl Router {
     pub(super) fn next_chunk(&mut self, now: Now) -> Option<Output> {
         let values_wait = !self.values.paced.is_empty();
         let most = self.most();
-        let header = crate::router::Values::action_header(now);
+        let header = self.values.action_header(now);
         let calls = self.calls.as_mut()?;
         let chunking = &mut calls.chunking;
         if chunking.is_empty() || !self.values.pace.is_open(now.monotonic) {
