@@ -132,6 +132,21 @@ impl<'c> Pair<'c> {
         })
     }
 
+    /// Returns the number of values of the topic that a bridge received from ROS.
+    fn received(at: usize) -> Option<u64> {
+        let status = metrics(METRICS[at])?;
+        let sent = status["topics"]["ua_1_2_12"]["sent"].as_u64()?;
+        Some(sent + status["redundancy"]["muted_sent"].as_u64()?)
+    }
+
+    /// Waits until a bridge receives values, which a restarted bridge does after it is a standby.
+    fn wait_for_values(at: usize) {
+        let before = Self::received(at).unwrap_or_default();
+        eventually("the standby receives the topic", SOON, || {
+            (Self::received(at)? > before + 20).then_some(())
+        });
+    }
+
     fn child(&self, at: usize) -> &Child {
         self.bridges[at].as_ref().unwrap()
     }
@@ -154,11 +169,7 @@ fn bench(faults: u64, seed: u64) -> ExitCode {
         .told()
         .start();
     eventually("both bridges receive the topic", SOON, || {
-        let receives = |at: usize| {
-            let status = metrics(METRICS[at])?;
-            let sent = status["topics"]["ua_1_2_12"]["sent"].as_u64()?;
-            Some(sent + status["redundancy"]["muted_sent"].as_u64()? > 3)
-        };
+        let receives = |at: usize| Pair::received(at).map(|received| received > 3);
         ([0, 1].map(receives) == [Some(true); 2]).then_some(())
     });
     publisher.tell("go");
@@ -170,6 +181,7 @@ fn bench(faults: u64, seed: u64) -> ExitCode {
     println!("{faults} random faults of the active bridge at 1 kHz, seed {seed}, {cores} cores\n");
     for turn in 0..faults {
         let active = pair.settled();
+        Pair::wait_for_values(1 - active);
         sleep(Duration::from_millis(300 + random.below(300)));
         if Pair::role(active).as_deref() != Some("active") {
             // A busy machine has changed the roles meanwhile.
