@@ -1,5 +1,5 @@
-"""Leaves a server with two subscriptions, of which one is durable, and looks from another session when the other
-one has ended. It prints the statuses of taking over both.
+"""Leaves a server with two subscriptions, of which one is durable, and looks from another session
+when the other one has ended. It prints the statuses of taking over both.
 """
 
 import argparse
