@@ -1,17 +1,15 @@
-//! Skills over worse networks: lost and delayed frames, and a link that is interrupted during a run.
+//! Skills over worse networks: a link that is interrupted during a run.
 
 use std::time::Duration;
 
-use skills::{
-    ClientOptions, Runs as _, SkillClient, SkillFault, SkillHandle, TypeName, Value as Told,
-};
-use system_tests::{Cell, Child, Host, Started, THERE, WIRE, Wire, program};
+use skills::{ClientOptions, Runs as _, SkillClient, SkillFault, SkillHandle, TypeName};
+use system_tests::{Cable, Cell, Child, HERE, Started, THERE, WIRE, program};
 use tokio::time::{Instant, sleep};
 
 use super::SOON;
 
-/// A component at the other end of a wire.
-fn there(cell: &Cell, host: &Host) -> Child {
+/// A component at the other end of a cable.
+fn there(cell: &Cell, cable: &Cable) -> Child {
     let yaml = "{component: far, application_uri: 'urn:ua-bridge:system-tests:far', namespace: 9,
         security: [None], skills: [
           {name: Grasp, type: GraspSkillType, driver: {simulated: {duration: 5 s}}},
@@ -27,7 +25,7 @@ fn there(cell: &Cell, host: &Host) -> Child {
             "--interface",
             WIRE,
         ])
-        .on(host)
+        .beyond(cable)
         .start()
 }
 
@@ -61,45 +59,20 @@ fn on_this_host<T>(what: impl AsyncFnOnce() -> T) -> T {
 }
 
 #[test]
-fn runs_over_a_lossy_wire_are_late_and_each_is_run_once() {
-    let Some(cell) = Cell::with(&[]) else { return };
-    let host = cell.host(Wire {
-        loss: 0.05,
-        delay: Duration::from_millis(50),
-    });
-    let _component = there(&cell, &host);
-    on_this_host(async || {
-        let client = connected(SOON).await;
-        let release = one(&client, "ReleaseSkillType").await;
-        let mut numbers = Vec::new();
-        for _ in 0..10 {
-            let outcome = release
-                .run(Vec::<(String, Told)>::new(), SOON)
-                .await
-                .unwrap();
-            assert!(outcome.succeeded, "{outcome:?}");
-            numbers.push(outcome.run);
-        }
-        let each_once = numbers.windows(2).all(|two| two[1] == two[0] + 1);
-        assert!(each_once, "{numbers:?}");
-        client.close().await;
-    });
-}
-
-#[test]
 fn a_run_goes_on_while_the_link_is_gone_and_its_outcome_is_read_afterwards() {
     let Some(cell) = Cell::with(&[]) else { return };
-    let host = cell.host(Wire::default());
-    let _component = there(&cell, &host);
+    let cable = cell.cable();
+    cable.lay(HERE);
+    let _component = there(&cell, &cable);
     on_this_host(async || {
         // A caller that waits for its run by number gets the outcome after the link is back.
         let client = connected(Duration::from_secs(2)).await;
         let grasp = one(&client, "GraspSkillType").await;
         let run = grasp.execute(Vec::new(), None).await.unwrap();
         let gone = async {
-            host.cut();
+            cable.cut();
             sleep(Duration::from_secs(3)).await;
-            host.mend();
+            cable.mend();
         };
         let (outcome, ()) = tokio::join!(grasp.wait(run, SOON), gone);
         let outcome = outcome.unwrap();
@@ -112,9 +85,9 @@ fn a_run_goes_on_while_the_link_is_gone_and_its_outcome_is_read_afterwards() {
             while grasp.state().await.unwrap().state.name() != "Running" {
                 sleep(Duration::from_millis(20)).await;
             }
-            host.cut();
+            cable.cut();
             sleep(Duration::from_secs(3)).await;
-            host.mend();
+            cable.mend();
         };
         let (lost, ()) = tokio::join!(grasp.run(Vec::new(), SOON), gone);
         assert!(matches!(lost, Err(SkillFault::Lost(_))), "{lost:?}");
