@@ -202,8 +202,7 @@ impl<'d> Reading<'d> {
     /// Returns the IRI of a process by its ID.
     fn iri(&self, id: &str, kind: &str) -> String {
         let named = self.named(id);
-        let is_meant = self.names.contains_key(id) || is_absolute(named);
-        match is_meant && is_iri(named) {
+        match is_iri(named) {
             true => named.to_owned(),
             false => format!("urn:ua-bridge:{kind}:{}", escaped(id)),
         }
@@ -222,18 +221,12 @@ impl<'d> Reading<'d> {
                 skill_type: Some(skill_type),
             });
         }
-        let is_meant = self.names.contains_key(name) || is_absolute(wanted);
-        (is_meant && is_iri(wanted)).then(|| Need {
+        is_iri(wanted).then(|| Need {
             role,
             capability: Some(wanted.to_owned()),
             skill_type: None,
         })
     }
-}
-
-/// Returns whether a text is meant as an IRI. A name with a colon has the syntax of an IRI too.
-fn is_absolute(text: &str) -> bool {
-    text.starts_with("urn:") || text.contains("://")
 }
 
 /// Returns the first child element with a name.

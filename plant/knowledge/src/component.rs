@@ -279,10 +279,14 @@ impl Graph {
     }
 }
 
-/// Returns whether the whole text is an IRI.
+/// Returns whether the whole text is an IRI with an authority (`://`) or a known scheme. A name with
+/// a colon, such as `Dosing:Fill`, has the syntax of an IRI, and is none.
 #[must_use]
 pub fn is_iri(text: &str) -> bool {
-    oxigraph::model::NamedNode::new(text).is_ok()
+    let (scheme, rest) = text.split_once(':').unwrap_or_default();
+    let is_known = |known: &&str| scheme.eq_ignore_ascii_case(known);
+    let is_absolute = rest.starts_with("//") || SCHEMES.iter().any(is_known);
+    is_absolute && oxigraph::model::NamedNode::new(text).is_ok()
 }
 
 /// Escapes an identifier for the fragment of an IRI, and keeps the `=` of identifiers.
@@ -293,5 +297,7 @@ fn fragment(identifier: &str) -> String {
     }
 }
 
+/// Schemes of IRIs without an authority.
+const SCHEMES: [&str; 4] = ["urn", "tag", "did", "mailto"];
 /// The namespace of OPC UA itself.
 pub const OPC_UA: &str = "http://opcfoundation.org/UA/";

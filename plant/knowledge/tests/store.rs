@@ -565,3 +565,25 @@ fn half_a_node_set_is_refused_with_its_line() {
         Err(nodeset::NodeSetFault::NoModel)
     );
 }
+
+#[test]
+fn names_with_a_colon_are_no_iris() {
+    for iri in [
+        "urn:example:a",
+        "URN:example:a",
+        "http://example.org/a#b",
+        "tag:example.org,2026:a",
+    ] {
+        assert!(knowledge::is_iri(iri), "{iri}");
+    }
+    for name in [
+        "Dosing:Fill",
+        "001:Dosing",
+        "a",
+        "",
+        "urn:a b",
+        "http://a b",
+    ] {
+        assert!(!knowledge::is_iri(name), "{name}");
+    }
+}
