@@ -202,6 +202,14 @@ impl Orders {
             | (Command::Clear, Ended | Aborted) => drop(self.all.remove(place)),
             (Command::Abort, NotAllowedToStart | AllowedToStart) => order.state = Aborted,
             (Command::Stop | Command::Abort, Running) => {
+                let progress = order.job.and_then(|job| runs.progress(job));
+                let is_running = |of: &JobProgress| of.outcome == JobOutcome::Running;
+                // A stop gives back the components of a run with an unknown outcome, which the
+                // client has not seen yet.
+                if !progress.as_ref().is_some_and(is_running) {
+                    self.poll(runs);
+                    return Status::InvalidState;
+                }
                 let end = if command == Command::Stop {
                     Ended
                 } else {
@@ -459,6 +467,27 @@ mod tests {
                 *runs.calls.lock().unwrap(),
                 ["start urn:p", "stop 7", "stop 7"]
             );
+        }
+    }
+
+    #[test]
+    fn a_stop_of_a_run_gives_back_no_components_after_an_end_that_was_not_shown() {
+        for (outcome, shown) in [
+            (JobOutcome::Unknown, OrderState::Interrupted),
+            (JobOutcome::Done, OrderState::Ended),
+            (JobOutcome::Failed, OrderState::Aborted),
+        ] {
+            let runs = Fakes::default();
+            let mut orders = Orders::default();
+            orders.store(job_order("one", "urn:p"), &runs);
+            orders.command("one", Command::Start, &runs);
+            *runs.outcome.lock().unwrap() = Some(outcome);
+            assert_eq!(
+                orders.command("one", Command::Stop, &runs),
+                Status::InvalidState
+            );
+            assert_eq!(state(&orders), shown);
+            assert_eq!(*runs.calls.lock().unwrap(), ["start urn:p"]);
         }
     }
 
