@@ -153,20 +153,20 @@ impl JobControl {
     /// Shows the job orders.
     fn show(&self, shown: &Shown) {
         let Some(list) = &shown.list else { return };
-        let all: Vec<ExtensionObject> = {
-            let orders = self.orders();
-            let one = |order: &Order| {
-                ExtensionObject::from_message(JobOrderAndState {
-                    order: order.order.clone(),
-                    states: Some(vec![state(order)]),
-                })
-            };
-            orders.all().iter().map(one).collect()
+        // Locked until the list is shown, so that no older list replaces it.
+        let orders = self.orders();
+        let one = |order: &Order| {
+            ExtensionObject::from_message(JobOrderAndState {
+                order: order.order.clone(),
+                states: Some(vec![state(order)]),
+            })
         };
+        let all: Vec<ExtensionObject> = orders.all().iter().map(one).collect();
         let value = DataValue::new_now(Variant::from(all));
         if let Err(status) = shown.server.show_value(list, value) {
             warn!(%status, "cannot show the job orders");
         }
+        drop(orders);
     }
 
     /// Follows the runs of the job orders.
