@@ -121,6 +121,18 @@ pub(crate) fn in_group<T>(
     })
 }
 
+/// Joins the group and runs `looking` to its end. Own datagrams are received too: the kernel counts
+/// each datagram that it filters like one that is lost because the socket is full.
+fn in_group_with_own<T>(
+    group: &Group,
+    looking: impl AsyncFnOnce(Live) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    look(async {
+        let live = Live::with(group, carrier::open_with_own(group)?)?;
+        looking(live).await
+    })
+}
+
 /// The programs in a group.
 #[derive(Debug, Default)]
 pub(crate) struct InGroup {
@@ -141,7 +153,14 @@ pub(crate) async fn in_the_group(group: &Group, seconds: f64) -> Result<(InGroup
 
 impl Live {
     fn join(group: &Group) -> Result<Self, Failure> {
-        let (carrier, shown_group) = carrier::open(group)?;
+        Self::with(group, carrier::open(group)?)
+    }
+
+    /// Creates the connection from a carrier and the address of its group for output.
+    fn with(
+        group: &Group,
+        (carrier, shown_group): (Box<dyn Carrier>, String),
+    ) -> Result<Self, Failure> {
         Ok(Self {
             carrier,
             start: Instant::now(),

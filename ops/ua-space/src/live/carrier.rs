@@ -12,6 +12,15 @@ use crate::exit::Failure;
 
 /// Opens the group or broker of the command line. Returns its address for output too.
 pub(super) fn open(group: &Group) -> Result<(Box<dyn Carrier>, String), Failure> {
+    open_as(group, false)
+}
+
+/// Opens the group or broker like [`open`]. The kernel does not filter own datagrams of the group.
+pub(super) fn open_with_own(group: &Group) -> Result<(Box<dyn Carrier>, String), Failure> {
+    open_as(group, true)
+}
+
+fn open_as(group: &Group, own: bool) -> Result<(Box<dyn Carrier>, String), Failure> {
     let settings = group.broker.as_deref().map(settings).transpose()?;
     let broker = match &group.address {
         Some(url) if BrokerAddress::is_mqtt(url) => {
@@ -50,6 +59,7 @@ pub(super) fn open(group: &Group) -> Result<(Box<dyn Carrier>, String), Failure>
     };
     let options = Options {
         interface: group.interface.clone(),
+        own,
         ..Options::new(address)
     };
     let udp = Udp::open(&options).map_err(|error| Failure::Unavailable(error.to_string()))?;

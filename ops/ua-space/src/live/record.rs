@@ -23,7 +23,7 @@ use super::book::{Kind, News};
 use super::channels::{DESCRIBED_WITHIN, is_value};
 use super::list::{FIRST_ASKED, json};
 use super::text::harmless;
-use super::{Go, Incoming, LOOK, Live, in_group, take, until};
+use super::{Go, Incoming, LOOK, Live, in_group_with_own, take, until};
 use crate::arguments::Record;
 use crate::capture::Link;
 use crate::cell::own_drops;
@@ -33,7 +33,8 @@ use crate::report::warn;
 /// Runs `ua-space record`.
 pub(crate) fn record(arguments: &Record) -> Result<(), Failure> {
     let format = Format::of(&arguments.file)?;
-    in_group(&arguments.group, async |mut live| {
+    // The drops of the socket are reported as lost messages.
+    in_group_with_own(&arguments.group, async |mut live| {
         live.want_calls(FIRST_ASKED);
         let mut recording = Recording::new(format, &arguments.file, &live)?;
         let ended = recording.run(&mut live, arguments).await;

@@ -6,6 +6,7 @@ use std::net::IpAddr;
 use Severity::{Error, Note, Warning};
 use serde::Serialize;
 
+use super::super::processes::UdpSocket;
 use super::facts::Facts;
 use super::host::{HALT_POLL, IPFRAG_HIGH, RMEM_MAX};
 
@@ -190,17 +191,12 @@ fn port_holders(facts: &Facts) -> Vec<Finding> {
     let Some(group) = facts.group.socket() else {
         return Vec::new();
     };
-    let own = std::process::id();
-    let ours: BTreeSet<u32> = facts.host.processes.iter().map(|one| one.pid).collect();
     let at_port = facts
         .host
         .udp
         .iter()
         .filter(|one| one.local.port() == group.port());
-    let strangers = at_port.filter(|one| {
-        let is_known = one.pid.is_some_and(|pid| ours.contains(&pid) || pid == own);
-        !is_known && one.command != "ua-space" && one.command != "ua-bridge"
-    });
+    let strangers = at_port.filter(|one| !is_ours(facts, one));
     let strangers = strangers.map(|one| {
         let who = match (one.pid, one.command.as_str()) {
             (Some(pid), command) => format!("{command} (process {pid})"),
@@ -222,6 +218,16 @@ fn port_holders(facts: &Facts) -> Vec<Finding> {
     strangers.collect()
 }
 
+/// Returns whether a socket is of a program of the cell or of its tools.
+fn is_ours(facts: &Facts, socket: &UdpSocket) -> bool {
+    let is_program = |pid| {
+        let mut programs = facts.host.processes.iter();
+        programs.any(|program| program.pid == pid) || pid == std::process::id()
+    };
+    let is_tool = ["ua-space", "ua-bridge"].contains(&socket.command.as_str());
+    is_tool || socket.pid.is_some_and(is_program)
+}
+
 fn socket_drops(facts: &Facts) -> Vec<Finding> {
     let Some(group) = facts.group.socket() else {
         return Vec::new();
@@ -231,7 +237,9 @@ fn socket_drops(facts: &Facts) -> Vec<Finding> {
         .udp
         .iter()
         .filter(|one| one.local.port() == group.port());
-    let dropping = at_port.filter(|one| one.drops > 0);
+    // The programs of a cell let the kernel filter their own datagrams, which it counts like lost
+    // datagrams.
+    let dropping = at_port.filter(|one| one.drops > 0 && !is_ours(facts, one));
     let dropping = dropping.map(|one| {
         let who = match one.command.as_str() {
             "" => "a socket",

@@ -1,7 +1,7 @@
 use std::net::Ipv4Addr;
 
 use super::super::super::pages::{CertificatePage, Page, TopicPage};
-use super::super::super::processes::{Process, UdpSocket};
+use super::super::super::processes::Process;
 use super::super::facts::Announced;
 use super::super::host::{InterfaceFacts, Route, Switch};
 use super::*;
@@ -129,7 +129,10 @@ fn holders_of_the_port_and_lost_datagrams_are_found() {
     };
     assert_eq!(after(|facts| facts.host.udp.push(socket(99, 0))), ["D005"]);
     assert!(after(|facts| facts.host.udp.push(socket(7, 0))).is_empty());
-    assert_eq!(after(|facts| facts.host.udp.push(socket(7, 3))), ["D006"]);
+    let lost = after(|facts| facts.host.udp.push(socket(99, 3)));
+    assert!(lost.contains(&"D006"), "{lost:?}");
+    // The kernel counts the own datagrams that a program filters.
+    assert!(after(|facts| facts.host.udp.push(socket(7, 3))).is_empty());
 }
 
 #[test]
