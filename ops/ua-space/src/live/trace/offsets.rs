@@ -108,6 +108,10 @@ async fn exchange(url: &str) -> Option<Exchange> {
     let received = unix_nanos();
     let there = i128::from(pages.first()?.time_us?) * 1000;
     let at = i128::midpoint(sent, received);
+    // The clock of this host was set back meanwhile.
+    if received < sent {
+        return None;
+    }
     Some(Exchange {
         at,
         offset: there - at,
