@@ -7,7 +7,7 @@
 
 use std::collections::HashMap;
 use std::collections::hash_map::RandomState;
-use std::hash::{BuildHasher, Hash, Hasher};
+use std::hash::{BuildHasher, DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -147,6 +147,7 @@ impl Routes {
         };
         let identity = self.identity(&message);
         let sight = self.seen.note(identity, Some(path), now.monotonic);
+        let sight = self.sight_of_commands(sight, &message, scope, (path, now.monotonic));
         // Several programs send the same probe.
         if sight == Sight::Copy && scope.role != MessageRole::Probe {
             return Judgement {
@@ -160,13 +161,17 @@ impl Routes {
         }
         let content = self.content(&message, scope);
         let stores = self.ends.get(path.carrier).and_then(End::within);
-        // No receiver on UDP checks the age, and this program may have been stopped for a while.
+        // This program may have been stopped for a while, and no receiver on UDP checks the age.
         let acts = content.is_command()
             || matches!(scope.role, MessageRole::Request | MessageRole::HiddenCall);
-        let judged = stores.or((acts && self.has_udp(&carriers)).then_some(Broker::WITHIN));
+        let judged = stores.or(acts.then_some(Broker::WITHIN));
+        // Probes are forwarded only to carriers of their publisher. The copy of a probe that arrives
+        // at such a carrier may be a forwarded one.
+        let is_echo = sight == Sight::Copy && self.is_at(path.carrier, scope.publisher);
         let refused = match (sight, judged) {
             // A loop is at least this fast, and a repetition by a program is slower.
             (Sight::Repeated { since }, _) if since < LOOP => Some(LOOPED),
+            _ if is_echo => Some(LOOPED),
             // On UDP each repetition of a command has a new time, so that a broker could deliver
             // the command after it was given up.
             (Sight::Repeated { .. }, _) if content.is_command() && stores.is_none() => {
@@ -201,9 +206,55 @@ impl Routes {
         }
     }
 
-    fn has_udp(&self, carriers: &[usize]) -> bool {
-        let mut ends = carriers.iter().filter_map(|to| self.ends.get(*to));
-        ends.any(|end| matches!(end.medium, CarrierMedium::Udp(_)))
+    /// Returns whether a carrier has names of the publisher.
+    fn is_at(&self, carrier: usize, publisher: u16) -> bool {
+        let end = self.ends.get(carrier);
+        end.is_some_and(|end| end.has_space(publisher))
+    }
+
+    /// Returns the sight of a message of several writers: a command that it repeats beside new
+    /// values makes it a repetition.
+    fn sight_of_commands(
+        &mut self,
+        sight: Sight,
+        message: &NetworkMessage<'_>,
+        scope: MessageScope,
+        (path, now): (MessagePath, Instant),
+    ) -> Sight {
+        let mut result = sight;
+        for identity in self.commands(message, scope) {
+            let of_command = self.seen.note(identity, Some(path), now);
+            if sight == Sight::New && matches!(of_command, Sight::Repeated { .. }) {
+                result = of_command;
+            }
+        }
+        result
+    }
+
+    /// Returns the identities that the commands of a message of several writers have as messages of
+    /// their own.
+    fn commands(&self, message: &NetworkMessage<'_>, scope: MessageScope) -> Vec<u64> {
+        if scope.writer.is_some() || scope.role != MessageRole::Value || is_hidden(message) {
+            return Vec::new();
+        }
+        let mut identities = Vec::new();
+        for data in message.messages().filter_map(Result::ok) {
+            let variable = data.writer_id.and_then(|of| self.variable(scope, of));
+            let is_command = variable.is_some_and(|variable| variable.confirmed_within.is_some());
+            if !is_command || data.kind == MessageKind::KeepAlive {
+                continue;
+            }
+            let mut hasher = self.hasher(message);
+            if hash_numbers(&data, &mut hasher) {
+                identities.push(hasher.finish());
+            }
+        }
+        identities
+    }
+
+    fn variable(&self, scope: MessageScope, writer: u16) -> Option<&Variable> {
+        let topic = TopicId::new(scope.publisher, scope.group?, writer)?;
+        self.mapping.variable(topic)
     }
 
     /// Returns the carriers that a message of a carrier is forwarded to.
@@ -236,10 +287,7 @@ impl Routes {
             MessageRole::Announcement => {
                 let is_here = match group {
                     Some(_) => home == Some(by),
-                    None => self
-                        .ends
-                        .get(by)
-                        .is_some_and(|end| end.has_space(publisher)),
+                    None => self.is_at(by, publisher),
                 };
                 if is_here { others() } else { Vec::new() }
             }
@@ -265,15 +313,24 @@ impl Routes {
         !is_request || !is_hidden || message.is_sealed() || call().is_some_and(|call| call.open)
     }
 
-    /// Returns what the mapping says about the contents of a message.
+    /// Returns what the mapping says about the contents of a message. A message of several writers
+    /// counts as its most urgent command, if it has one.
     fn content(&self, message: &NetworkMessage<'_>, scope: MessageScope) -> Content<'_> {
-        let topic = || TopicId::new(scope.publisher, scope.group?, scope.writer?);
+        let command = || {
+            let writers = message.writer_ids().into_iter().flatten();
+            let variables = writers.filter_map(|writer| self.variable(scope, writer));
+            let commands = variables.filter(|variable| variable.confirmed_within.is_some());
+            commands.min_by_key(|variable| variable.confirmed_within)
+        };
         let is_readable = scope.role == MessageRole::Value && !is_hidden(message);
         let is_keep_alive = |data: Result<DataSetMessage<'_>, DecodeError>| {
             data.is_ok_and(|data| data.kind == MessageKind::KeepAlive)
         };
         Content {
-            variable: topic().and_then(|topic| self.mapping.variable(topic)),
+            variable: match scope.writer {
+                Some(writer) => self.variable(scope, writer),
+                None => command(),
+            },
             has_value: !(is_readable && message.messages().all(is_keep_alive)),
         }
     }
@@ -281,10 +338,7 @@ impl Routes {
     /// Returns the identity of a message, which its copies share, also if a broker had the copy as
     /// JSON.
     fn identity(&self, message: &NetworkMessage<'_>) -> u64 {
-        let mut hasher = self.random.build_hasher();
-        format_id(message.publisher_id()).hash(&mut hasher);
-        let group = message.group().and_then(|group| group.writer_group_id);
-        group.hash(&mut hasher);
+        let mut hasher = self.hasher(message);
         let is_plain = message.message_type() == NetworkMessageType::DataSet
             && !(is_hidden(message) || message.is_action());
         let mut is_numbered = is_plain;
@@ -294,11 +348,7 @@ impl Routes {
                     is_numbered = false;
                     break;
                 };
-                let header = data.header();
-                let time = header.timestamp.map(|time| time.0);
-                let is_keep_alive = data.kind == MessageKind::KeepAlive;
-                is_numbered &= header.sequence_number.is_some() || time.is_some();
-                (data.writer_id, header.sequence_number, time, is_keep_alive).hash(&mut hasher);
+                is_numbered &= hash_numbers(&data, &mut hasher);
             }
         }
         if !is_numbered {
@@ -306,6 +356,25 @@ impl Routes {
         }
         hasher.finish()
     }
+
+    /// Returns a hasher that has the publisher and the group of a message.
+    fn hasher(&self, message: &NetworkMessage<'_>) -> DefaultHasher {
+        let mut hasher = self.random.build_hasher();
+        format_id(message.publisher_id()).hash(&mut hasher);
+        let group = message.group().and_then(|group| group.writer_group_id);
+        group.hash(&mut hasher);
+        hasher
+    }
+}
+
+/// Hashes the ids and numbers of a DataSetMessage. Returns whether it has a number or a time, which
+/// distinguishes it from other messages of its writer.
+fn hash_numbers(data: &DataSetMessage<'_>, hasher: &mut DefaultHasher) -> bool {
+    let header = data.header();
+    let time = header.timestamp.map(|time| time.0);
+    let is_keep_alive = data.kind == MessageKind::KeepAlive;
+    (data.writer_id, header.sequence_number, time, is_keep_alive).hash(hasher);
+    header.sequence_number.is_some() || time.is_some()
 }
 
 /// Returns the number of a PublisherId, or a hash of its text.

@@ -1,8 +1,10 @@
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use uadp::action::{ActionCall, ActionEncoder, ActionHeader, ActionStart, ActionState};
+use uadp::discovery::Probe;
 use uadp::{
     DataSetHeader, DateTime, Extras, GroupHeader, NetworkHeader, NetworkMessageEncoder, Scalar,
+    SecurityHeader,
 };
 
 use super::*;
@@ -86,6 +88,25 @@ fn value(
     let mut frame = message.key_frame(&about).unwrap();
     frame.scalar(Scalar::Double(1.5)).unwrap();
     frame.finish().unwrap();
+    message.finish().unwrap();
+    bytes
+}
+
+/// Returns a message with a value of `ua_0_2_21` and a command of `ua_0_2_20`, by their sequence
+/// numbers.
+fn value_and_command(value: u16, command: u16, sent: Timestamp) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let network = header(0, 2, Some(sent));
+    let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&[21, 20])).unwrap();
+    for number in [value, command] {
+        let about = DataSetHeader {
+            sequence_number: Some(number),
+            ..DataSetHeader::default()
+        };
+        let mut frame = message.key_frame(&about).unwrap();
+        frame.scalar(Scalar::Double(1.5)).unwrap();
+        frame.finish().unwrap();
+    }
     message.finish().unwrap();
     bytes
 }
@@ -244,6 +265,50 @@ fn a_command_crosses_once_and_only_in_time() {
 }
 
 #[test]
+fn a_command_among_other_values_crosses_once_too() {
+    let mut routes = routes_of(&CELL.replace("ua_0_2_20", "ua_0_2"));
+    let now = start();
+    let first = routes.judge(&value_and_command(1, 1, now.utc), path(UDP, 9), now);
+    let forward = first.forward.unwrap();
+    assert!(forward.command && !forward.replaceable);
+    assert_eq!(forward.within, Some(Duration::from_millis(500)));
+    // The value is new, and the command is repeated with a new time of sending.
+    let next = later(now, 200);
+    let repeated = routes.judge(&value_and_command(2, 1, next.utc), path(UDP, 9), next);
+    assert_eq!(repeated.not_forwarded, Some(REPEATED));
+    assert_eq!((repeated.dropped, repeated.forward), (None, None));
+    let other = routes.judge(&value_and_command(3, 2, next.utc), path(UDP, 9), next);
+    assert_eq!(targets(&other), [MQTT]);
+}
+
+#[test]
+fn a_probe_does_not_go_round_between_the_carriers_of_a_divided_space() {
+    let mut routes = routes_of(&CELL.replace("ua_2_5_60", "ua_1_3"));
+    let now = start();
+    let probe = |publisher| {
+        let mut bytes = Vec::new();
+        let id = Some(PublisherId::UInt16(publisher));
+        let encoded = Probe::PublisherEndpoints.encode(id, SecurityHeader::NONE, &mut bytes);
+        encoded.unwrap();
+        bytes
+    };
+    let divided = probe(1);
+    assert_eq!(targets(&routes.judge(&divided, path(UDP, 9), now)), [MQTT]);
+    // Another program forwards the same probe. It is delivered here, and not forwarded again.
+    for by in [path(MQTT, 1), path(UDP, 8)] {
+        let echo = routes.judge(&divided, by, later(now, 100));
+        assert_eq!((echo.dropped, echo.not_forwarded), (None, Some(LOOPED)));
+        assert_eq!(targets(&echo), NOWHERE);
+    }
+    // The publisher is at one carrier: the probes of several programs reach it.
+    let single = probe(2);
+    for port in [9, 8] {
+        let judgement = routes.judge(&single, path(UDP, port), now);
+        assert_eq!(targets(&judgement), [MQTT]);
+    }
+}
+
+#[test]
 fn a_late_message_of_a_broker_is_not_forwarded() {
     let (mut routes, now) = (routes(), start());
     let event = (2, 5, 61);
@@ -277,25 +342,27 @@ fn a_command_of_a_broker_counts_for_its_own_time() {
 }
 
 #[test]
-fn a_command_crosses_between_two_groups_only_in_time() {
-    let cell = CELL.replace(
+fn a_command_of_udp_crosses_only_in_time() {
+    let groups = CELL.replace(
         "mqtt: {address: mqtt://broker.local}",
         "udp: {address: opc.udp://239.192.0.41}",
     );
-    let (mut routes, now) = (routes_of(&cell), start());
-    for (number, sent, age, refused) in [
-        (1, Some(now.utc), 500, None),
-        (2, Some(now.utc), 501, Some(LATE)),
-        (3, None, 0, Some(UNTIMED)),
-    ] {
-        let bytes = value((0, 2, 20), number, (sent, None));
-        let judgement = routes.judge(&bytes, path(UDP, 9), later(now, age));
-        assert_eq!(judgement.not_forwarded, refused, "{age} ms");
+    for cell in [CELL, &groups] {
+        let (mut routes, now) = (routes_of(cell), start());
+        for (number, sent, age, refused) in [
+            (1, Some(now.utc), 500, None),
+            (2, Some(now.utc), 501, Some(LATE)),
+            (3, None, 0, Some(UNTIMED)),
+        ] {
+            let bytes = value((0, 2, 20), number, (sent, None));
+            let judgement = routes.judge(&bytes, path(UDP, 9), later(now, age));
+            assert_eq!(judgement.not_forwarded, refused, "{age} ms");
+        }
+        // The age of other values does not matter.
+        let state = value((1, 2, 10), 1, (Some(now.utc), None));
+        let judgement = routes.judge(&state, path(UDP, 9), later(now, 60_000));
+        assert_eq!(targets(&judgement), [1]);
     }
-    // The age of other values does not matter.
-    let state = value((1, 2, 10), 1, (Some(now.utc), None));
-    let judgement = routes.judge(&state, path(UDP, 9), later(now, 60_000));
-    assert_eq!(targets(&judgement), [1]);
 }
 
 #[test]
