@@ -10,7 +10,7 @@ use plant_opcua::changes::Became;
 use plant_opcua::client::{
     CallError, Client, ClientConfig, ClientError, Link, Notice, Select, Subscription, Watch,
 };
-use plant_opcua::types::{ObjectId, ObjectTypeId, StatusCode};
+use plant_opcua::types::{DateTime, ObjectId, ObjectTypeId, StatusCode};
 use registry::hierarchy::Place;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -160,11 +160,14 @@ impl Tending {
         let mut changes = of.client.subscribe(vec![model_changes()], TOLD_EVERY, 10);
         loop {
             let began = Instant::now();
+            // The run before the search: its NodeIds are not valid for a later run.
+            let run = of.client.started();
             // A server that executes a method may not respond to other requests.
             if known.is_none() || !of.client.is_calling() {
                 match mirror::look(of.client).await {
                     Ok(looked) if known.as_ref() != Some(&looked) => {
-                        self.show(of, &looked, copy.as_mut(), &mut feeds).await;
+                        self.show((of, run), &looked, copy.as_mut(), &mut feeds)
+                            .await;
                         known = Some(looked);
                     }
                     Ok(_) => self.answers_again(of, copy.as_ref()),
@@ -218,29 +221,30 @@ impl Tending {
     /// Shows the nodes of a server, and repeats its values and events.
     async fn show(
         &self,
-        of: &Connected<'_>,
+        (of, run): (&Connected<'_>, Option<DateTime>),
         looked: &Mirror,
         copy: Option<&mut ServerCopy>,
         feeds: &mut Feeds,
     ) {
-        of.callers.serve(of.client.started());
-        if let Some(copy) = copy {
-            match copy.show(looked) {
-                Ok((added, changed)) => {
-                    let target = Target {
-                        face: copy.face().server.clone(),
-                        translation: copy.translation(),
-                        root: copy.root(),
-                        name: of.name.to_owned(),
-                    };
-                    target.read(of.client, &added).await;
-                    self.feed(of, looked, (copy, added, target), feeds);
-                    if changed {
-                        copy.face().tell(&copy.root(), Became::Added);
-                    }
+        let shown = copy.map(|copy| (copy.show(looked), copy));
+        // The nodes of an earlier run are replaced: no call reaches this run by their NodeIds.
+        of.callers.serve(run);
+        match shown {
+            Some((Ok((added, changed)), copy)) => {
+                let target = Target {
+                    face: copy.face().server.clone(),
+                    translation: copy.translation(),
+                    root: copy.root(),
+                    name: of.name.to_owned(),
+                };
+                target.read(of.client, &added).await;
+                self.feed(of, looked, (copy, added, target), feeds);
+                if changed {
+                    copy.face().tell(&copy.root(), Became::Added);
                 }
-                Err(error) => warn!(name = of.name, %error, "cannot show a server"),
             }
+            Some((Err(error), _)) => warn!(name = of.name, %error, "cannot show a server"),
+            None => {}
         }
         let (methods, variables) = (looked.methods(), looked.variables());
         self.board.note(self.level, of.url, |peer| {
