@@ -16,7 +16,6 @@ use plant_opcua::types::{
     DataValue, DateTime, ExtensionObject, LocalizedText, NodeId, QualifiedName, RelativePath,
     StatusCode, Variant,
 };
-use plant_opcua::users::Access;
 use serde_json::Value as Json;
 use tokio::runtime::Handle;
 use tracing::{info, warn};
@@ -193,7 +192,6 @@ impl skills::server::Extension for JobControl {
         server: &Server,
         component: &NodeId,
         ids: &mut IdRange,
-        _users: &Arc<Access>,
     ) -> Result<(), InstanceError> {
         let index = server.namespace(NAMESPACE).unwrap_or_default();
         let mut object = |type_name: &str, name: &str| -> Result<Instance, InstanceError> {

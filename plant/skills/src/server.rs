@@ -103,7 +103,6 @@ pub trait Extension: std::fmt::Debug + Send + Sync {
         server: &Server,
         component: &NodeId,
         ids: &mut IdRange,
-        users: &Arc<Access>,
     ) -> Result<(), InstanceError>;
 }
 
@@ -153,7 +152,6 @@ impl ComponentServer {
         mut observers: impl FnMut(u16, &Facts) -> Vec<Box<dyn Observer>>,
     ) -> Result<Self, ServeFault> {
         let users = users_of(component, settings)?;
-        let all_users = Arc::clone(&users);
         let server = server_of(component, settings, &users)?;
         let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
         let root = root(&server, component, &mut ids)?;
@@ -219,7 +217,7 @@ impl ComponentServer {
         let values = (values, &configuration);
         let values = values::serve(&server, &root.node_id, &mut ids, values, &mut tasks)?;
         if let Some(extension) = &settings.extension {
-            extension.serve(&server, &root.node_id, &mut ids, &all_users)?;
+            extension.serve(&server, &root.node_id, &mut ids)?;
         }
         if let Some(node) = root.node("LeaseHolder") {
             let node = node.clone();
