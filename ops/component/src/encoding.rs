@@ -174,6 +174,7 @@ fn body(structure: &CallStructure, value: &Json) -> Result<Vec<u8>, String> {
             },
         };
         body.extend(bytes.map_err(|why| format!("{}: {why}", field.name))?);
+        has_room(body.len())?;
     }
     Ok(body)
 }
@@ -193,6 +194,7 @@ fn inline(rank: Rank, structure: &CallStructure, value: Option<&Json>) -> Result
     let mut bytes = length(elements.len())?.to_vec();
     for (at, element) in elements.iter().enumerate() {
         bytes.extend(body(structure, element).map_err(|why| format!("[{at}]: {why}"))?);
+        has_room(bytes.len())?;
     }
     Ok(bytes)
 }
@@ -211,6 +213,14 @@ fn has_length(rank: Rank, given: usize) -> Result<(), String> {
             Err(format!("it has {length} values, and {given} are given"))
         }
         Rank::Array { .. } | Rank::Scalar => Ok(()),
+    }
+}
+
+/// Checks the size of a message. Arrays of fixed length in each other multiply their lengths.
+fn has_room(size: usize) -> Result<(), String> {
+    match size <= MOST_BYTES {
+        true => Ok(()),
+        false => Err(format!("it is larger than {MOST_BYTES} bytes")),
     }
 }
 
@@ -239,6 +249,8 @@ const STRING_NODE: u8 = 3;
 const BINARY_BODY: u8 = 1;
 /// Maximum number of elements of an array of fixed length that are set to default values.
 const MOST_ELEMENTS: usize = 65_536;
+/// Maximum size of a message within a message.
+const MOST_BYTES: usize = 16 << 20;
 /// 1970 as a DateTime, which stands for no time in ROS messages.
 const UNIX_EPOCH: i64 = 116_444_736_000_000_000;
 
@@ -314,6 +326,35 @@ mod tests {
         assert_eq!(weight.length().unwrap(), Some(0), "an empty name");
         assert_eq!(second.len(), 4 + 3 * 8 + 4);
         assert!(objects.next().is_none());
+    }
+
+    #[test]
+    fn fixed_arrays_in_each_other_are_refused_before_they_fill_the_memory() {
+        let fixed = |name: &str, of: BuiltinType, structure| CallField {
+            rank: Rank::Array {
+                fixed: Some(60_000),
+            },
+            structure,
+            ..CallField::array(name, of)
+        };
+        let inner = CallStructure {
+            name: "a/Inner".to_owned(),
+            fields: vec![fixed("values", BuiltinType::Double, None)],
+        };
+        let outer = CallStructure {
+            name: "a/Outer".to_owned(),
+            fields: vec![fixed(
+                "parts",
+                BuiltinType::ExtensionObject,
+                Some(Arc::new(inner)),
+            )],
+        };
+        let field = CallField {
+            structure: Some(Arc::new(outer)),
+            ..CallField::scalar("goal", BuiltinType::ExtensionObject)
+        };
+        let why = encoded(&field, &json!({}), 7).unwrap_err();
+        assert!(why.contains("larger than"), "{why}");
     }
 
     #[test]
