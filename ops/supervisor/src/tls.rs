@@ -96,6 +96,8 @@ struct Current {
     key: Arc<CertifiedKey>,
     /// The times of modification of both files.
     modified: [Option<SystemTime>; 2],
+    /// The times of the files that could not be read, which is logged once.
+    refused: Option<[Option<SystemTime>; 2]>,
 }
 
 impl Resolver {
@@ -104,7 +106,11 @@ impl Resolver {
         let key = pair.read()?;
         Ok(Self {
             pair,
-            current: Mutex::new(Current { key, modified }),
+            current: Mutex::new(Current {
+                key,
+                modified,
+                refused: None,
+            }),
         })
     }
 
@@ -116,10 +122,18 @@ impl Resolver {
         if modified != current.modified {
             match self.pair.read() {
                 Ok(key) => {
-                    *current = Current { key, modified };
+                    *current = Current {
+                        key,
+                        modified,
+                        refused: None,
+                    };
                     info!("the page uses the renewed certificate");
                 }
-                Err(error) => warn!(%error, "the page keeps the previous certificate"),
+                Err(error) if current.refused != Some(modified) => {
+                    warn!(%error, "the page keeps the previous certificate");
+                    current.refused = Some(modified);
+                }
+                Err(_) => {}
             }
         }
         Arc::clone(&current.key)
