@@ -2,7 +2,7 @@
 //! an overlap is refused with both names.
 use crate::cell;
 
-use bridge_core::{AskId, CallDescription, CallRole, Local, Offered, Output, Reason};
+use bridge_core::{AskErrorKind, AskId, CallDescription, CallRole, Local, Offered, Output, Reason};
 use cell::{Cell, Program, component, ms, topic};
 
 /// The bridges of space 2.
@@ -35,6 +35,19 @@ fn plant(a: &[u16], b: &[u16]) -> Cell {
     cell.programs.push(component(6));
     cell.run(ms(1_000));
     cell
+}
+
+fn offered() -> Offered {
+    Offered {
+        description: CallDescription {
+            name: "Weld".to_owned(),
+            about: String::new(),
+            role: CallRole::Call,
+            request: Vec::new(),
+            response: Vec::new(),
+        },
+        open: true,
+    }
 }
 
 /// Returns the overlaps that a program reported: the namespace and the name of the other program.
@@ -85,16 +98,6 @@ fn each_value_and_command_crosses_the_bridge_of_its_namespace() {
 #[test]
 fn a_call_is_executed_and_offered_by_the_bridge_of_its_namespace() {
     let mut cell = plant(&[5], &[6]);
-    let offered = || Offered {
-        description: CallDescription {
-            name: "Weld".to_owned(),
-            about: String::new(),
-            role: CallRole::Call,
-            request: Vec::new(),
-            response: Vec::new(),
-        },
-        open: true,
-    };
     let (weld, grip) = (topic(2, 6, 61), topic(0, 5, 105));
     for at in [A, B] {
         cell.offer(at, weld, offered());
@@ -133,6 +136,26 @@ fn the_bridge_that_started_first_keeps_a_namespace_and_the_other_names_it() {
         cell.texts(B, command).last().map(String::as_str),
         Some("on")
     );
+}
+
+#[test]
+fn a_request_in_a_namespace_of_another_bridge_is_not_sent_and_its_outcome_is_unknown() {
+    let mut cell = plant(&[5, 6], &[6, 7]);
+    let grip = topic(0, 6, 105);
+    cell.offer(COMMANDER_6, grip, offered());
+    cell.run(ms(1_000));
+    // Both bridges receive the request of a client in the graph.
+    for at in [A, B] {
+        cell.ask(at, AskId(1), (grip, &cell::block(&[])), ms(2_000));
+    }
+    cell.run(ms(50));
+    assert_eq!(cell.executions(COMMANDER_6).len(), 1);
+    let answers = cell.answers(B);
+    let kinds: Vec<AskErrorKind> = answers
+        .iter()
+        .filter_map(|(_, answer)| Some(answer.as_ref().err()?.kind))
+        .collect();
+    assert_eq!(kinds, [AskErrorKind::Unknown], "{answers:?}");
 }
 
 #[test]

@@ -290,9 +290,13 @@ impl Router {
         timeout: Duration,
         now: Now,
     ) {
-        let begun = match self.is_muted_now(now) {
-            true => Err(takeover::not_asked(self.values.shows_values())),
-            false => self.begin(topic, request, timeout, now),
+        let (_, namespace, _) = topic.triple();
+        let begun = if self.is_muted_now(now) {
+            Err(takeover::not_asked(self.values.shows_values()))
+        } else if self.values.carries(namespace) {
+            self.begin(topic, request, timeout, now)
+        } else {
+            Err(takeover::not_carried(namespace))
         };
         let calls = self.calls_mut(now);
         let call = calls.table.entry(topic).or_default();

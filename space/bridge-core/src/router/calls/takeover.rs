@@ -136,13 +136,29 @@ pub(super) fn not_asked(is_server: bool) -> (Cause, AskError) {
         let error = AskError::refused(Refusal::NotExecutable, text);
         return ((Reason::CallRefused, "standby").into(), error);
     }
-    let error = AskError {
+    let text =
+        "this redundant bridge is not active, so it is unknown whether the call was executed";
+    (
+        (Reason::Takeover, "request").into(),
+        unknown(text.to_owned()),
+    )
+}
+
+/// Returns the outcome of a request that this program does not send, because another bridge of the
+/// space carries the namespace: that bridge may have received the request of the local side too.
+pub(super) fn not_carried(namespace: u16) -> (Cause, AskError) {
+    let text = format!(
+        "another bridge of the space carries namespace {namespace}, so it is unknown whether the call was executed"
+    );
+    ((Reason::SpaceTaken, "request").into(), unknown(text))
+}
+
+const fn unknown(text: String) -> AskError {
+    AskError {
         kind: AskErrorKind::Unknown,
         status: BAD_NO_COMMUNICATION,
-        text: "this redundant bridge is not active, so it is unknown whether the call was executed"
-            .to_owned(),
-    };
-    ((Reason::Takeover, "request").into(), error)
+        text,
+    }
 }
 
 /// Bad_NoCommunication (OPC 10000-6, A.2).
