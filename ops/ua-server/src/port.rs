@@ -298,7 +298,12 @@ impl Port for ServerPort {
                     self.leaving = Some(gone_out);
                     self.confirms.supersede(topic);
                     self.confirms.arrivals.sent(topic, awaited);
-                    self.others.sources.write(topic, &block, answer);
+                    if self.role.is_standby() {
+                        // The role has changed since the client wrote: the Router drops the value.
+                        let _gone = answer.send(StatusCode::BadInvalidState);
+                    } else {
+                        self.others.sources.write(topic, &block, answer);
+                    }
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
@@ -400,6 +405,11 @@ impl Port for ServerPort {
         self.space.hear(router.heard(), self.receive_timeout);
         self.alarms.publishers(router, self.receive_timeout);
         self.show_service_level();
+    }
+
+    fn drop_waiting(&mut self, _at_once: bool) {
+        // The values of the space are only shown. Values for other servers are commands.
+        self.others.sources.drop_waiting();
     }
 
     fn role_changed(&mut self, is_active: bool) {
@@ -557,7 +567,7 @@ impl ServerPort {
             status: quality,
         } = sourced;
         let said = status(quality);
-        if !quality.is_bad() {
+        if !quality.is_bad() && !self.role.is_standby() {
             self.others.sources.put(topic, &block);
         }
         let shown = self.space.update(topic, block.clone(), (Some(taken), said));

@@ -259,6 +259,13 @@ impl Sources {
         }
     }
 
+    /// Drops all values that wait to be written, because another redundant server is active.
+    pub(crate) fn drop_waiting(&self) {
+        for running in self.servers.values() {
+            running.outbox.clear();
+        }
+    }
+
     /// Handles that the writer of a value is silent: its last value is not repeated to a server
     /// that reconnects.
     pub(crate) fn set_silent(&self, topic: TopicId) {

@@ -148,6 +148,25 @@ impl Outbox {
         }
     }
 
+    /// Drops the waiting values and the last values of states, because another program writes to
+    /// the server from this moment on.
+    pub(super) fn clear(&self) {
+        let mut waiting = self.waiting.lock();
+        let mut dropped = 0;
+        for lane in waiting.topics.values_mut() {
+            lane.last = None;
+            for mut value in lane.values.drain(..) {
+                value.answer(StatusCode::BadInvalidState);
+                dropped += 1;
+            }
+        }
+        waiting.turns.clear();
+        drop(waiting);
+        if dropped > 0 {
+            self.state.not_written(count(dropped));
+        }
+    }
+
     /// Handles a connect of the server: the states of the cell are written to it.
     pub(super) fn up(&self) {
         let mut waiting = self.waiting.lock();
@@ -314,6 +333,26 @@ mod tests {
         // lost.
         assert_eq!(outbox.state.told().not_written, 3);
     }
+
+    #[test]
+    fn nothing_waits_or_is_repeated_once_another_program_writes() {
+        let (state, topic) = outbox(Overflow::KeepLatest);
+        let (event, event_topic) = outbox(Overflow::DropOldest(NonZeroU16::new(2).unwrap()));
+        for (outbox, topic) in [(&state, topic), (&event, event_topic)] {
+            outbox.up();
+            outbox.put(topic, b"1");
+            let (answer, mut answered) = oneshot::channel();
+            outbox.write(topic, b"2", answer);
+            outbox.clear();
+            assert_eq!(answered.try_recv(), Ok(StatusCode::BadInvalidState));
+            assert_eq!(taken(outbox), [""; 0]);
+            outbox.down();
+            outbox.up();
+            assert_eq!(taken(outbox), [""; 0], "a state is not repeated");
+            assert_eq!(outbox.state.told().not_written, 2);
+        }
+    }
+
     #[test]
     fn each_write_of_a_client_has_its_own_result() {
         let (state, topic) = outbox(Overflow::KeepLatest);
