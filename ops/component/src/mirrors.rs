@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::time::Duration;
 
 use bridge_node::actions::OwnActions;
-use bridge_node::{Executed, Execution, ExecutionId, PortEvent};
+use bridge_node::{Executed, Execution, ExecutionId, PortEvent, Refusal, now};
 use mappings::TopicId;
 use plant_opcua::client::{Client, Link};
 use program::Method;
@@ -207,10 +207,20 @@ impl ForeignSkills {
             return false;
         };
         let by = Owner::Local("a call of the space");
-        let Execution { id, request, .. } = execution;
+        let Execution {
+            id,
+            request,
+            start_by,
+            ..
+        } = execution;
         drop(tokio::spawn(async move {
-            let answer = executor.answer(by, method, &request).await;
-            let outcome = Executed::Answered(fields::block(&answer));
+            let outcome = if start_by < now().monotonic {
+                // The program was stopped, and another redundant server may have taken over.
+                Executed::Refused(Refusal::NotExecutable)
+            } else {
+                let answer = executor.answer(by, method, &request).await;
+                Executed::Answered(fields::block(&answer))
+            };
             drop(room.send(PortEvent::Executed {
                 execution: id,
                 outcome,

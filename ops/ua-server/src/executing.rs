@@ -9,7 +9,7 @@ mod watch;
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_node::{Executed, Execution, ExecutionId, Offered, PortEvent, Refusal, now};
 use mappings::{Access, ExecutedBy, Mapping, MethodTarget, TopicId};
@@ -235,7 +235,8 @@ impl Executing {
 
     /// Acknowledges an alarm, unless the caller has stopped waiting.
     fn acknowledge(&self, execution: &Execution) -> Executed {
-        if execution.deadline <= now().monotonic {
+        let now = now().monotonic;
+        if execution.deadline <= now || execution.start_by < now {
             return Executed::Refused(Refusal::NotExecutable);
         }
         self.alarms.execute(execution)
@@ -247,6 +248,7 @@ impl Executing {
             topic,
             request,
             deadline,
+            start_by,
             ..
         } = execution;
         let found = self.found.get(topic).ok_or(Refusal::NotExecutable)?;
@@ -261,7 +263,7 @@ impl Executing {
         if within.is_zero() {
             return Err(Refusal::NotExecutable);
         }
-        let call = call(Arc::clone(found), arguments, within);
+        let call = call(Arc::clone(found), arguments, (within, *start_by));
         let task = self.running.spawn(call);
         self.executions.insert(task.id(), (*id, *topic));
         Ok(())
@@ -284,7 +286,15 @@ fn arguments(request: &[u8], signature: &Signature) -> Result<Vec<Variant>, Refu
     arguments.collect()
 }
 
-async fn call(found: Arc<Found>, arguments: Vec<Variant>, within: Duration) -> Executed {
+async fn call(
+    found: Arc<Found>,
+    arguments: Vec<Variant>,
+    (within, start_by): (Duration, Instant),
+) -> Executed {
+    if start_by < now().monotonic {
+        // The program was stopped, and another redundant server may have taken over.
+        return Executed::Refused(Refusal::NotExecutable);
+    }
     let Found {
         wanted,
         client,
