@@ -142,8 +142,8 @@ impl Driver {
             let due = now + timeout;
             let rings = timeout < SHORT && self.alarm.ring_at(due, now).is_ok();
             // Only an earlier deadline needs the timer wheel; a later deadline is detected when the
-            // timer fires.
-            if !rings && (timer.is_elapsed() || due < timer.deadline()) {
+            // timer fires. An elapsed timer is ready at each poll, also while the alarm is set.
+            if timer.is_elapsed() || !rings && due < timer.deadline() {
                 timer.as_mut().reset(due);
             }
             if !poll_fn(|cx| self.poll_wake(timer.as_mut(), cx)).await {
