@@ -185,6 +185,9 @@ impl<P: Port> Shell<P> {
             if phase == Phase::Closing && self.port.pending().is_empty() {
                 return Ok(());
             }
+            // The inbox of a process has no budget of its own, unlike a socket: a flood from
+            // another thread must not keep the other tasks of this thread from running.
+            tokio::task::consume_budget().await;
             self.arm(timer.as_mut());
             let yields = std::mem::take(&mut more) || self.busy.looks(|| now().monotonic);
             tokio::select! {
