@@ -11,11 +11,11 @@ import lifetime
 from opcua_services import Server, durable, statuses
 
 COUNT = ua.NodeId(ua.ObjectIds.Server_ServerDiagnostics_ServerDiagnosticsSummary_CurrentSubscriptionCount)
-# The lifetime is three publishing intervals.
+# A lifetime of 3 s: long enough to prepare both subscriptions on a busy machine.
 SHORT = {
     "RequestedPublishingInterval": 20.0,
     "RequestedMaxKeepAliveCount": 1,
-    "RequestedLifetimeCount": 3,
+    "RequestedLifetimeCount": 150,
     "PublishingEnabled": True,
 }
 

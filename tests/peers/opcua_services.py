@@ -476,11 +476,11 @@ async def _(server):
 
 @row("CreateMonitoredItems", "7.22.4", "the Maximum of an interval", "9/401")
 async def _(server):
-    # The interval began before the values, and ends behind them.
+    # The interval began before the values, and ends behind them also on a busy machine.
     start = datetime.datetime.now(datetime.timezone.utc) - datetime.timedelta(milliseconds=500)
     for value in (7.0, 9.0, 8.0):
         (await server.write({"value": value})).check()
-    return await server.first({"filter": aggregate("Maximum", 1_500.0, start)})
+    return await server.first({"filter": aggregate("Maximum", 5_500.0, start)})
 
 
 row("CreateMonitoredItems", "5.13.1.5", "an overflow that discards the oldest value", "3/480 4/0")(

@@ -284,15 +284,15 @@ fn row(name: &str, gaps: &mut [f64]) {
         return;
     }
     gaps.sort_by(f64::total_cmp);
-    let at = |share: f64| gaps[((gaps.len() - 1) as f64 * share) as usize];
+    let at = |percent: usize| gaps[(gaps.len() - 1) * percent / 100];
     let within = gaps.iter().filter(|gap| **gap <= 150.0).count();
     println!(
         "| {name} | {} | {:.0} ms | {:.0} ms | {:.0} ms | {:.0} ms | {within} |",
         gaps.len(),
-        at(0.5),
-        at(0.9),
-        at(0.99),
-        at(1.0)
+        at(50),
+        at(90),
+        at(99),
+        at(100)
     );
 }
 
