@@ -194,7 +194,10 @@ impl Carriers {
                 };
                 is_idle = false;
                 match received {
-                    Err(error) => return Taken::Message(Err(error)),
+                    Err(error) => {
+                        self.next = number + 1;
+                        return Taken::Message(Err(error));
+                    }
                     Ok(received) if self.admit(number, received, buffer) => {
                         return Taken::Message(Ok(received));
                     }
@@ -408,6 +411,8 @@ mod tests {
     #[derive(Debug, Default)]
     struct Wire {
         incoming: VecDeque<(Vec<u8>, SocketAddr)>,
+        /// Whether receiving fails.
+        fails: bool,
         outgoing: Vec<Vec<u8>>,
         is_lost: bool,
         change: Option<CarrierChange>,
@@ -435,7 +440,11 @@ mod tests {
         }
 
         fn try_recv(&mut self, buffer: &mut Vec<u8>) -> Option<io::Result<Received>> {
-            let (bytes, from) = self.0.lock().unwrap().incoming.pop_front()?;
+            let mut wire = self.0.lock().unwrap();
+            if wire.fails {
+                return Some(Err(io::Error::other("cut")));
+            }
+            let (bytes, from) = wire.incoming.pop_front()?;
             buffer[..bytes.len()].copy_from_slice(&bytes);
             let length = bytes.len();
             Some(Ok(Received {
@@ -565,6 +574,17 @@ mod tests {
             order.push(buffer[0]);
         }
         assert_eq!(order, [2, 3, 2, 2, 2]);
+    }
+
+    #[test]
+    fn a_carrier_that_fails_again_and_again_leaves_room_for_the_other() {
+        let (mut carriers, a, b) = pair();
+        let mut buffer = vec![0; 16];
+        a.0.lock().unwrap().fails = true;
+        arrives(&b, &[3], 2);
+        assert!(carriers.try_recv(&mut buffer).unwrap().is_err());
+        assert!(carriers.try_recv(&mut buffer).unwrap().is_ok());
+        assert_eq!(buffer[0], 3);
     }
 
     #[test]
