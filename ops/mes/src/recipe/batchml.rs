@@ -12,7 +12,7 @@ use mtp::escaped;
 use roxmltree::Node;
 use serde_json::Value;
 
-use super::flow::{Edge, Flow, NodeCondition, NodeKind};
+use super::flow::{Edge, Flow, MOST_FLOW_NODES, NodeCondition, NodeKind, too_large};
 use super::values::{self, Written};
 use super::{Reading, child, children, text_of};
 use crate::process::{Given, Job, Need, Process, ResultOf, Role, Step};
@@ -221,6 +221,12 @@ impl<'d> Reading<'d> {
         parts: &mut RecipeParts<'d>,
         open: &mut Vec<Node<'d, 'd>>,
     ) -> Option<(Places<'d>, BTreeMap<usize, Node<'d, 'd>>)> {
+        // Elements that are used several times on each level multiply their numbers.
+        let more = logic.children().filter(Node::is_element).count();
+        if parts.flow.nodes.len().saturating_add(more) > MOST_FLOW_NODES {
+            self.error(logic, too_large());
+            return None;
+        }
         let mut is_whole = true;
         let mut places: Places<'d> = BTreeMap::new();
         let mut conditions: BTreeMap<usize, Node<'d, 'd>> = BTreeMap::new();

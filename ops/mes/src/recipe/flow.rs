@@ -110,6 +110,11 @@ impl Reading<'_> {
     /// Returns the steps of a flow in an order in which they can be done.
     pub(super) fn steps(&mut self, flow: &Flow) -> Option<Vec<Step>> {
         let before = self.errors.len();
+        if flow.nodes.len() > MOST_FLOW_NODES {
+            let at = flow.nodes.first().map_or(0, |node| node.at);
+            self.error_at(at, too_large());
+            return None;
+        }
         let order = self.ordered(flow)?;
         let mut guards: Vec<Guard> = flow.nodes.iter().map(|_| Guard::new()).collect();
         let mut after: Vec<BTreeSet<usize>> = flow.nodes.iter().map(|_| BTreeSet::new()).collect();
@@ -423,5 +428,12 @@ fn joined(guard: &Guard) -> Option<(usize, usize, Vec<NodeCondition>)> {
     None
 }
 
+/// Returns the finding about a process with too many elements.
+pub(super) fn too_large() -> String {
+    format!("the process has more than {MOST_FLOW_NODES} steps, gateways, transitions and links")
+}
+
+/// Maximum number of nodes of a process.
+pub(super) const MOST_FLOW_NODES: usize = 4_000;
 /// Maximum number of alternatives of a guard.
 const MOST_ALTERNATIVES: usize = 32;

@@ -383,6 +383,48 @@ fn a_real_recipe_is_read_with_the_names_that_it_needs() {
 }
 
 #[test]
+fn elements_that_multiply_on_each_level_are_refused() {
+    use std::fmt::Write as _;
+
+    let mut elements = String::new();
+    for level in 0..9 {
+        let mut logic = String::new();
+        for number in 1..10 {
+            write!(
+                logic,
+                "<Link><ID>L{number}</ID><FromID><FromIDValue>S{}</FromIDValue><FromType>Step</FromType></FromID>\
+                 <ToID><ToIDValue>S{number}</ToIDValue><ToType>Step</ToType></ToID><LinkType>ControlLink</LinkType></Link>",
+                number - 1
+            )
+            .unwrap();
+        }
+        for number in 0..10 {
+            write!(
+                logic,
+                "<Step><ID>S{number}</ID><RecipeElementID>E{}</RecipeElementID></Step>",
+                level + 1
+            )
+            .unwrap();
+        }
+        let logic = format!("<ProcedureLogic>{logic}</ProcedureLogic>");
+        match level {
+            0 => elements.push_str(&logic),
+            _ => write!(
+                elements,
+                "<RecipeElement><ID>E{level}</ID>{logic}</RecipeElement>"
+            )
+            .unwrap(),
+        }
+    }
+    let text = format!(
+        "<BatchInformation xmlns=\"http://www.mesa.org/xml/B2MML\"><MasterRecipe><ID>r</ID>{elements}\
+         <RecipeElement><ID>E9</ID><Description>urn:c:stir</Description></RecipeElement></MasterRecipe></BatchInformation>"
+    );
+    let errors = errors(&text);
+    assert!(errors[0].contains("more than 4000"), "{errors:?}");
+}
+
+#[test]
 fn broken_files_end_with_a_line() {
     for (text, why) in [
         ("", "line 1"),
