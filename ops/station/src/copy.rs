@@ -2,7 +2,7 @@
 //! only the nodes that differ, so that clients keep their subscriptions to all others.
 
 use std::collections::{BTreeMap, HashMap};
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use plant_opcua::server::{InstanceError, MethodSpec, ObjectSpec, TypeSpec, VariableSpec};
 use plant_opcua::types::{
@@ -25,6 +25,8 @@ pub(crate) struct ServerCopy {
     /// The nodes by their paths, each with its children behind it.
     nodes: BTreeMap<String, Found>,
     translation: Arc<Translation>,
+    /// The source timestamps of the values that were marked as last values, by their variables.
+    doubted: Mutex<HashMap<NodeId, Option<DateTime>>>,
 }
 
 /// A variable of a server, and its copy.
@@ -59,6 +61,7 @@ impl ServerCopy {
             callers: Arc::clone(callers),
             nodes: BTreeMap::new(),
             translation: Arc::default(),
+            doubted: Mutex::default(),
         }
     }
 
@@ -307,26 +310,45 @@ impl ServerCopy {
 
     /// Marks the values of all variables after the loss of the server: they have no value.
     pub(crate) fn lose(&self, status: StatusCode) {
+        self.doubted().clear();
         let values = self.variables().into_iter();
         let values = values.map(|of| (of.shown, without_value(status)));
         self.set(values.collect());
     }
 
-    /// Marks the values of a server that does not respond as its last values, or the same values as
-    /// current values when the server responds again.
-    pub(crate) fn doubt(&self, is_busy: bool) {
-        let (from, to) = match is_busy {
-            true => (StatusCode::Good, StatusCode::UncertainLastUsableValue),
-            false => (StatusCode::UncertainLastUsableValue, StatusCode::Good),
-        };
-        let values = self.variables().into_iter().filter_map(|of| {
-            let mut value = self.face.server.value(&of.shown)?;
-            (value.status() == from).then(|| {
-                value.status = Some(to);
-                (of.shown, value)
-            })
+    /// Marks the values of a server that does not respond as its last values.
+    pub(crate) fn doubt(&self) {
+        let mut doubted = self.doubted();
+        let mut values = Vec::new();
+        for of in self.variables() {
+            let Some(mut value) = self.face.server.value(&of.shown) else {
+                continue;
+            };
+            if value.status() == StatusCode::Good {
+                value.status = Some(StatusCode::UncertainLastUsableValue);
+                doubted.insert(of.shown.clone(), value.source_timestamp);
+                values.push((of.shown, value));
+            }
+        }
+        self.set(values);
+    }
+
+    /// Marks the values that were marked as last values as current values: the server responds again.
+    /// A value that the server itself doubts stays as it is.
+    pub(crate) fn trust_again(&self) {
+        let mut doubted = self.doubted();
+        let values = doubted.drain().filter_map(|(node, timestamp)| {
+            let mut value = self.face.server.value(&node)?;
+            let is_marked = value.status() == StatusCode::UncertainLastUsableValue
+                && value.source_timestamp == timestamp;
+            value.status = Some(StatusCode::Good);
+            is_marked.then_some((node, value))
         });
         self.set(values.collect());
+    }
+
+    fn doubted(&self) -> MutexGuard<'_, HashMap<NodeId, Option<DateTime>>> {
+        self.doubted.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn set(&self, values: Vec<(NodeId, DataValue)>) {

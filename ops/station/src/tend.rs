@@ -174,7 +174,7 @@ impl Tending {
                     Err(_) if of.client.is_calling() => {}
                     Err(ClientError::Lost(_)) if known.is_some() => {
                         if let Some(copy) = &copy {
-                            copy.doubt(true);
+                            copy.doubt();
                         }
                         self.fault(of.url, BUSY, ANSWERS_NOTHING.to_owned());
                     }
@@ -231,6 +231,8 @@ impl Tending {
         of.callers.serve(run);
         match shown {
             Some((Ok((added, changed)), copy)) => {
+                // A busy server may respond again with other nodes.
+                copy.trust_again();
                 let target = Target {
                     face: copy.face().server.clone(),
                     translation: copy.translation(),
@@ -315,7 +317,7 @@ impl Tending {
             }
         });
         if let Some(copy) = copy.filter(|_| was_busy) {
-            copy.doubt(false);
+            copy.trust_again();
         }
     }
 
