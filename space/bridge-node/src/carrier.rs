@@ -25,7 +25,7 @@ use routes::LiveRoutes;
 /// The source of own messages for a carrier that does not return them. No sender has this address.
 pub(crate) const NO_SOURCE: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 
-/// Opens the carrier of a space, which is connected with the other carriers of the process by `hub`.
+/// Opens the carrier of a space, which `hub` connects with the other carriers of the process.
 /// Returns the options of its socket too, if it uses UDP.
 pub(crate) fn open(
     (program, own): (&str, SpaceId),

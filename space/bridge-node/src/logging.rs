@@ -140,9 +140,9 @@ pub trait LogSink: Send + Sync + 'static {
     fn hear(&self, record: LogRecord);
 }
 
-/// Registers `sink` for every warning and error of our own crates while it is alive, except those of
-/// other programs of the process than `program`. Messages of libraries are excluded, because a sink
-/// that uses a library would receive messages about its own work.
+/// Registers `sink` for every warning and error of our own crates while it is alive. Messages of
+/// other programs of the process than `program` are excluded. So are messages of libraries, because
+/// a sink that uses a library would receive messages about its own work.
 pub fn hear_log(program: &'static str, sink: &Arc<impl LogSink>) {
     let sink: Arc<dyn LogSink> = Arc::clone(sink) as _;
     let mut sinks = SINKS.write().unwrap_or_else(PoisonError::into_inner);

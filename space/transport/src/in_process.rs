@@ -1,8 +1,8 @@
 //! Messages between the programs of a process, beside the network.
 //!
-//! A [`ProcessHub`] connects the carriers of one process that use the same group. A message that one of
-//! them sends goes to the network as without a hub, and to the inbox of each other carrier of the
-//! hub. The copy of that message that the network returns to the process is dropped, so each
+//! A [`ProcessHub`] connects the carriers of one process that use the same group. A message that a
+//! carrier sends goes to the network as without a hub, and to the inbox of each other carrier of
+//! the hub. The copy of that message that the network returns to the process is dropped, so each
 //! program receives the message once.
 
 use std::collections::{BTreeMap, VecDeque};

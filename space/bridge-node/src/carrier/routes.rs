@@ -165,8 +165,8 @@ impl Routes {
         let acts = content.is_command()
             || matches!(scope.role, MessageRole::Request | MessageRole::HiddenCall);
         let judged = stores.or(acts.then_some(Broker::WITHIN));
-        // Probes are forwarded only to carriers of their publisher. The copy of a probe that arrives
-        // at such a carrier may be a forwarded one.
+        // Probes are forwarded only to carriers of their publisher. The copy of a probe that
+        // arrives at such a carrier may be a forwarded one.
         let is_echo = sight == Sight::Copy && self.is_at(path.carrier, scope.publisher);
         let refused = match (sight, judged) {
             // A loop is at least this fast, and a repetition by a program is slower.
@@ -300,8 +300,8 @@ impl Routes {
         }
     }
 
-    /// Returns whether a request may cross. A broker hides the sender of a request, and the executor
-    /// would take it for a request of this program.
+    /// Returns whether a request may cross. A broker hides the sender of a request, and the
+    /// executor would treat it as a request of this program.
     fn may_cross(&self, message: &NetworkMessage<'_>, scope: MessageScope, by: usize) -> bool {
         let is_request = matches!(scope.role, MessageRole::Request | MessageRole::HiddenCall);
         let is_hidden = self.ends.get(by).is_some_and(|end| match &end.medium {

@@ -72,7 +72,7 @@ fn the_kernel_stamps_a_datagram_at_its_arrival_and_not_when_it_is_read() {
                 let received = carrier.recv(&mut buffer).await.unwrap();
                 let stamp = received.stamp.unwrap();
                 assert!(before <= stamp, "{stamp:?}");
-                // The kernel begins to stamp at the arrival soon after the first socket asks for it.
+                // The kernel stamps at the arrival soon after the first socket asks for it.
                 if stamp <= arrived {
                     break;
                 }
