@@ -275,7 +275,7 @@ mod tests {
         let (mut alarm, rings) = Alarm::new().unwrap();
         let rings = watched(rings).unwrap();
         let mut took = Vec::new();
-        for _ in 0..20 {
+        for turn in 0..500 {
             let now = Instant::now();
             alarm
                 .ring_at(now + Duration::from_micros(300), now)
@@ -285,6 +285,9 @@ mod tests {
             let ready = tokio::time::timeout(Duration::from_secs(10), rings.readable());
             ready.await.unwrap().unwrap().clear_ready();
             took.push(now.elapsed());
+            if turn >= 20 && took.iter().any(|took| *took < Duration::from_millis(1)) {
+                break;
+            }
         }
         assert!(took.iter().all(|took| *took >= Duration::from_micros(300)));
         // The machine may be busy; the timer of the runtime needs a millisecond each time.
