@@ -1,4 +1,4 @@
-//! Ten thousand topics: time and memory of the start, and repetitions that are spread over their
+//! Ten thousand topics: memory of the start, and repetitions that are spread over their
 //! period.
 
 use std::sync::Arc;
@@ -83,20 +83,13 @@ impl Many {
 }
 
 #[test]
-#[expect(
-    clippy::disallowed_methods,
-    reason = "the time of the start is measured"
-)]
-fn ten_thousand_topics_start_within_five_seconds_and_take_less_than_6_kb_each() {
-    let start = Instant::now();
+fn ten_thousand_topics_take_less_than_6_kb_each() {
     let mut many = None;
     let counted = measure(|| {
         let mut made = Many::new();
         made.start();
         many = Some(made);
     });
-    let took = start.elapsed();
-    assert!(took < Duration::from_secs(5), "{took:?}");
     let each = counted.bytes_current / i64::from(TOPICS);
     assert!(each < 6000, "{each} bytes");
     assert_eq!(many.unwrap().router.topics().count(), usize::from(TOPICS));
