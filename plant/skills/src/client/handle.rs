@@ -419,14 +419,25 @@ impl SkillHandle {
                 }
                 return Ok(());
             }
-            match self.outcome_of(0).await {
-                Ok(Some(_)) => return Ok(()),
-                Ok(None) => {}
-                // There is no run.
-                Err(SkillFault::Refused { .. }) => return Ok(()),
-                Err(fault) => return Err(fault),
+            if self.has_no_run().await? {
+                return Ok(());
             }
             tokio::time::sleep(PUBLISHING).await;
+        }
+    }
+
+    /// Asks the component whether no run is in progress.
+    async fn has_no_run(&self) -> Result<bool, SkillFault> {
+        match self.outcome_of(0).await {
+            Ok(outcome) => Ok(outcome.is_some()),
+            Err(SkillFault::Refused { status, .. }) => {
+                // There was no run.
+                match status == StatusCode::BadNotFound.to_string() {
+                    true => Ok(true),
+                    false => Err(goes_on(&self.name())),
+                }
+            }
+            Err(fault) => Err(fault),
         }
     }
 
@@ -561,6 +572,11 @@ impl Runs for SkillHandle {
         };
         // The skill may be Halted already, which is the wanted state.
         match &error {
+            // The state that a station repeats may be older than the run.
+            CallError::Refused { .. } if self.asks_component() => match self.has_no_run().await {
+                Ok(true) => Ok(()),
+                Ok(false) | Err(_) => Err(called(&error, &format!("Halt of {}", self.name()))),
+            },
             CallError::Refused { .. } if self.state().await?.state == State::Halted => Ok(()),
             CallError::Client(ClientError::Lost(_))
             | CallError::Client(_)
