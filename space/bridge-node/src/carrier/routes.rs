@@ -177,7 +177,7 @@ impl Routes {
             (Sight::Repeated { .. }, _) if content.is_command() && stores.is_none() => {
                 Some(REPEATED)
             }
-            _ if !self.may_cross(&message, scope, path.carrier) => Some(NOT_AUTHORIZED),
+            _ if !self.may_cross(&message, scope, path) => Some(NOT_AUTHORIZED),
             (_, Some(within)) => content.refuse(&message, scope, within, now.utc),
             (Sight::New | Sight::Copy | Sight::Repeated { .. }, None) => None,
         };
@@ -262,15 +262,10 @@ impl Routes {
         let MessageScope {
             publisher,
             group,
-            writer,
             role,
+            writer: _,
         } = scope;
-        let home_of = |publisher| {
-            let covers = |name: &ForwardedName| name.covers(publisher, group, writer);
-            let mut ends = self.ends.iter();
-            ends.position(|end| end.names.iter().any(covers))
-        };
-        let home = home_of(publisher);
+        let home = self.home(publisher, scope);
         let others = || (0..self.ends.len()).filter(|to| *to != by).collect();
         let back = |home: Option<usize>| home.filter(|home| *home != by).into_iter().collect();
         match role {
@@ -281,7 +276,7 @@ impl Routes {
             }
             MessageRole::Request | MessageRole::HiddenCall => back(home),
             MessageRole::Response => requestor(message)
-                .map(|of| back(home_of(of)))
+                .map(|of| back(self.home(of, scope)))
                 .unwrap_or_default(),
             // An announcement of the whole publisher is needed with each of its topics.
             MessageRole::Announcement => {
@@ -300,17 +295,38 @@ impl Routes {
         }
     }
 
-    /// Returns whether a request may cross. A broker hides the sender of a request, and the
-    /// executor would treat it as a request of this program.
-    fn may_cross(&self, message: &NetworkMessage<'_>, scope: MessageScope, by: usize) -> bool {
-        let is_request = matches!(scope.role, MessageRole::Request | MessageRole::HiddenCall);
-        let is_hidden = self.ends.get(by).is_some_and(|end| match &end.medium {
-            CarrierMedium::Udp(_) => false,
+    /// Returns whether a request may cross. The executor would treat it as a request of this
+    /// program, so its sender is judged here as an executor at the carrier judges it.
+    fn may_cross(
+        &self,
+        message: &NetworkMessage<'_>,
+        scope: MessageScope,
+        path: MessagePath,
+    ) -> bool {
+        let is_request = match scope.role {
+            MessageRole::Request => true,
+            // A hidden message from the carrier of the executor is a response.
+            MessageRole::HiddenCall => self.home(scope.publisher, scope) != Some(path.carrier),
+            MessageRole::Value
+            | MessageRole::Announcement
+            | MessageRole::Probe
+            | MessageRole::Response => false,
+        };
+        let end = self.ends.get(path.carrier);
+        let is_stranger = end.is_some_and(|end| match &end.medium {
+            CarrierMedium::Udp(_) => !path.from.ip().is_loopback(),
             CarrierMedium::Mqtt(broker) => !broker.acl,
         });
         let topic = || TopicId::new(scope.publisher, scope.group?, scope.writer?);
         let call = || topic().and_then(|topic| self.mapping.call(topic));
-        !is_request || !is_hidden || message.is_sealed() || call().is_some_and(|call| call.open)
+        !is_request || !is_stranger || message.is_sealed() || call().is_some_and(|call| call.open)
+    }
+
+    /// Returns the carrier that lists a name of the publisher for the group and writer.
+    fn home(&self, publisher: u16, scope: MessageScope) -> Option<usize> {
+        let covers = |name: &ForwardedName| name.covers(publisher, scope.group, scope.writer);
+        let mut ends = self.ends.iter();
+        ends.position(|end| end.names.iter().any(covers))
     }
 
     /// Returns what the mapping says about the contents of a message. A message of several writers

@@ -378,6 +378,26 @@ fn requests_go_to_the_executor_and_responses_come_back() {
 }
 
 #[test]
+fn a_request_of_another_host_does_not_cross_as_one_of_this_program() {
+    let (mut routes, now) = (routes(), start());
+    let request = action(ActionKind::Request, (2, 5, 60), 1, Some(now.utc));
+    let elsewhere = MessagePath {
+        carrier: UDP,
+        from: SocketAddr::from(([10, 0, 0, 9], 9)),
+    };
+    let judgement = routes.judge(&request, elsewhere, now);
+    assert_eq!(judgement.not_forwarded, Some(NOT_AUTHORIZED));
+    assert_eq!(
+        (judgement.dropped, targets(&judgement)),
+        (None, &NOWHERE[..])
+    );
+    // The executor's response needs no permission.
+    let response = action(ActionKind::Response, (2, 5, 60), 1, None);
+    let by = path(MQTT, 1);
+    assert_eq!(targets(&routes.judge(&response, by, now)), [UDP]);
+}
+
+#[test]
 fn a_request_of_a_broker_crosses_only_while_the_caller_waits() {
     let cell = CELL.replace("[ua_1_2, ua_0_2_20]", "[ua_1_2, ua_1_5_60]");
     let (mut routes, now) = (routes_of(&cell), start());
