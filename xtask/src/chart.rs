@@ -271,7 +271,7 @@ impl Chart {
              .b0{{fill:#2dd4bf}}.b1{{fill:#1d5f58}}}}</style>\n"
         );
         // Writing to a String cannot fail.
-        let mut line = |text: String| drop(writeln!(svg, "{text}"));
+        let mut line = |text: String| _ = writeln!(svg, "{text}");
         for (at, name) in names.iter().enumerate() {
             let x = LEFT + 120.0 * amount(at);
             let class = at.min(2);

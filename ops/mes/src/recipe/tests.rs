@@ -320,7 +320,7 @@ fn recipes_come_back_from_the_graph_as_they_were() {
         let triples = recipe.processes[0].triples(&|_| None);
         knowledge.replace(&source, &triples, 1).unwrap();
         let read = crate::read_process::Processes::read(&knowledge).unwrap();
-        assert_eq!(read.faults, std::collections::BTreeMap::new());
+        assert_eq!(read.faults, BTreeMap::new());
         assert_eq!(read.all, recipe.processes);
     }
 }
