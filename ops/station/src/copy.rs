@@ -108,7 +108,8 @@ impl ServerCopy {
         for found in &mirror.nodes {
             let path = self.path_of(found);
             nodes.insert(found.id.clone(), id(&path));
-            wanted.insert(path, found.clone());
+            // A name may contain the sign between names: the first node of a path is shown.
+            wanted.entry(path).or_insert_with(|| found.clone());
         }
         self.translation.nodes(nodes);
         let mut changed = is_new || self.remove_outdated(&wanted);
@@ -161,7 +162,8 @@ impl ServerCopy {
         !outdated.is_empty()
     }
 
-    /// Adds the types of the server to the face. Returns their NodeIds by the NodeIds at the server.
+    /// Adds the types of the server to the face. Returns their NodeIds by the NodeIds at the
+    /// server.
     fn types(&self, mirror: &Mirror) -> HashMap<NodeId, NodeId> {
         let mut known = HashMap::new();
         for (at_server, of) in &mirror.types {
@@ -333,8 +335,8 @@ impl ServerCopy {
         self.set(values);
     }
 
-    /// Marks the values that were marked as last values as current values: the server responds again.
-    /// A value that the server itself doubts stays as it is.
+    /// Marks the values that were marked as last values as current values: the server responds
+    /// again. A value that the server itself doubts stays as it is.
     pub(crate) fn trust_again(&self) {
         let mut doubted = self.doubted();
         let values = doubted.drain().filter_map(|(node, timestamp)| {
