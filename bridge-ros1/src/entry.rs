@@ -27,8 +27,8 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     bridge_node::run::<BridgeRos1>(arguments)
 }
 
-/// Returns `bridge-ros1` for a process with several programs. `arguments` begin with the name of the
-/// program.
+/// Returns `bridge-ros1` for a process with several programs. `arguments` begin with the name of
+/// the program.
 ///
 /// # Errors
 /// The exit code if the arguments are invalid or ask for help; the message was printed.

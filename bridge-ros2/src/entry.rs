@@ -34,8 +34,8 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     bridge_node::run::<BridgeRos2>(arguments)
 }
 
-/// Returns `bridge-ros2` for a process with several programs. `arguments` begin with the name of the
-/// program.
+/// Returns `bridge-ros2` for a process with several programs. `arguments` begin with the name of
+/// the program.
 ///
 /// # Errors
 /// The exit code if the arguments are invalid or ask for help; the message was printed.
@@ -215,8 +215,8 @@ async fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, 
     Ok(addresses)
 }
 
-/// Returns the address of a host; RustDDS supports IPv4 only. The other programs of the thread go on
-/// while a name is resolved.
+/// Returns the address of a host; RustDDS supports IPv4 only. The other programs of the thread go
+/// on while a name is resolved.
 async fn address(host: &str) -> Result<IpAddr, Failure> {
     if let Ok(IpAddr::V6(_)) = host.parse() {
         let message = format!("peer {host}: only IPv4 addresses can be reached");

@@ -47,8 +47,8 @@ impl Cell {
             .args(["--interface", "lo", "--metrics", metrics])
     }
 
-    /// Returns several programs in one process, with bridge-ros2 in domain 2, not started yet. `args`
-    /// follow the arguments that every cell needs.
+    /// Returns several programs in one process, with bridge-ros2 in domain 2, not started yet.
+    /// `args` follow the arguments that every cell needs.
     #[must_use]
     pub fn ua_cell_started(&self, args: &[&str]) -> Started {
         self.with_ros1(Started::new("ua-cell", &program("ua-cell")))

@@ -36,7 +36,8 @@ pub(crate) fn make(folder: &Path) -> anyhow::Result<()> {
     make_named(folder, &NAMES)
 }
 
-/// Creates the links in a folder without the programs of the bridges, for which there are links, too.
+/// Creates the links in a folder without the programs of the bridges, for which there are links,
+/// too.
 ///
 /// # Errors
 /// Returns an error if the folder cannot be written.

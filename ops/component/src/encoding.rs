@@ -8,8 +8,8 @@ use uadp::BuiltinType;
 
 use crate::fields;
 
-/// Encodes a value as a Variant of the type of a field. `namespace` is the namespace of the call, in
-/// which the types of its structures are.
+/// Encodes a value as a Variant of the type of a field. `namespace` is the namespace of the call,
+/// in which the types of its structures are.
 pub(crate) fn encoded(field: &CallField, value: &Json, namespace: u16) -> Result<Vec<u8>, String> {
     if let Some(structure) = &field.structure {
         return structures(field.rank, structure, value, namespace);

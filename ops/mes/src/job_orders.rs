@@ -1,5 +1,5 @@
-//! Job orders (OPC 10031-4): their states, and the commands of clients. A job order names a process;
-//! its run is a job of the MES.
+//! Job orders (OPC 10031-4): their states, and the commands of clients. A job order names a
+//! process; its run is a job of the MES.
 
 use plant_opcua::job_control::JobOrder;
 use serde_json::Value as Json;

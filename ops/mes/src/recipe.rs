@@ -43,8 +43,8 @@ impl fmt::Display for Finding {
     }
 }
 
-/// Names of a file, with the names that they stand for: capabilities and types of skills, parameters
-/// and units.
+/// Names of a file, with the names that they stand for: capabilities and types of skills,
+/// parameters and units.
 pub(crate) type Names = BTreeMap<String, String>;
 
 /// A file with the names that it needs, as `ua-space process import` sends it.
@@ -208,8 +208,8 @@ impl<'d> Reading<'d> {
         }
     }
 
-    /// Returns the need for the capability or the type of skills that a name of the file stands for,
-    /// or is. The number of its role is set with the order of the steps.
+    /// Returns the need for the capability or the type of skills that a name of the file stands
+    /// for, or is. The number of its role is set with the order of the steps.
     fn need(&self, name: &str) -> Option<Need> {
         let wanted = self.named(name).trim();
         let role = Role::Alone(0);

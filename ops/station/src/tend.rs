@@ -1,5 +1,5 @@
-//! Supervises a server of a level: identifies it, configures its place and shows its nodes, until it
-//! is lost.
+//! Supervises a server of a level: identifies it, configures its place and shows its nodes, until
+//! it is lost.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;

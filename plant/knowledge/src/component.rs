@@ -279,8 +279,8 @@ impl Graph {
     }
 }
 
-/// Returns whether the whole text is an IRI with an authority (`://`) or a known scheme. A name with
-/// a colon, such as `Dosing:Fill`, has the syntax of an IRI, and is none.
+/// Returns whether the whole text is an IRI with an authority (`://`) or a known scheme. A name
+/// with a colon, such as `Dosing:Fill`, has the syntax of an IRI, and is none.
 #[must_use]
 pub fn is_iri(text: &str) -> bool {
     let (scheme, rest) = text.split_once(':').unwrap_or_default();

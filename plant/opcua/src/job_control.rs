@@ -1,5 +1,5 @@
-//! Job Control (OPC 10031-4, version 2): the structures of job orders and job responses, and the part
-//! of the NodeSet that servers of jobs need.
+//! Job Control (OPC 10031-4, version 2): the structures of job orders and job responses, and the
+//! part of the NodeSet that servers of jobs need.
 
 use std::io::{Read, Write};
 use std::sync::LazyLock;
@@ -279,7 +279,8 @@ structures! {
     }
 }
 
-/// An array that is an optional field. The depth of arrays in arrays is limited when they are decoded.
+/// An array that is an optional field. The depth of arrays in arrays is limited when they are
+/// decoded.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct OptionalArray<T>(pub Vec<T>);
 

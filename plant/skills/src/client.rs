@@ -96,8 +96,8 @@ pub struct SkillClient {
 }
 
 impl SkillClient {
-    /// Connects to the server at `endpoint`. An endpoint that ends with `#` and an ApplicationUri is
-    /// that of a component behind a station: the client sees only the skills of this component.
+    /// Connects to the server at `endpoint`. An endpoint that ends with `#` and an ApplicationUri
+    /// is that of a component behind a station: the client sees only the skills of this component.
     ///
     /// # Errors
     /// - [`SkillFault::Refused`] if the certificate of the server is not accepted
@@ -140,8 +140,8 @@ impl SkillClient {
         &self.endpoint
     }
 
-    /// Returns the ApplicationUri of the server, or of the component behind it to which the client is
-    /// restricted; empty while disconnected.
+    /// Returns the ApplicationUri of the server, or of the component behind it to which the client
+    /// is restricted; empty while disconnected.
     #[must_use]
     pub fn application_uri(&self) -> String {
         if let Some(behind) = &self.behind {

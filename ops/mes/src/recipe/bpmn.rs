@@ -1,5 +1,5 @@
-//! BPMN 2.0: service tasks, sequence flows, exclusive and parallel gateways, and boundary events for
-//! errors and timers.
+//! BPMN 2.0: service tasks, sequence flows, exclusive and parallel gateways, and boundary events
+//! for errors and timers.
 //!
 //! A service task is a step. Its capability is the `implementation`, or the name that the importer
 //! gives for its ID or its name. Its parameters are assignments of its data inputs, or those of the

@@ -17,8 +17,8 @@ use crate::runs::SkillFault;
 use crate::skill::lock;
 
 /// An index of the skills of known servers. It reads the skills of each server and retries until
-/// the server responds. Clones share the index. It keeps no connection open, except to stations, whose skills
-/// come and go: a caller that runs a skill connects with [`open`](Self::open).
+/// the server responds. Clones share the index. It keeps no connection open, except to stations,
+/// whose skills come and go: a caller that runs a skill connects with [`open`](Self::open).
 ///
 /// The discovery of servers reports them with [`seen`](Self::seen) and [`gone`](Self::gone).
 #[derive(Clone)]
@@ -48,8 +48,8 @@ struct Told {
 pub struct Detected {
     /// The ApplicationUri of its component, which may be behind a station.
     pub application_uri: String,
-    /// The URL of the server. For a component behind a station it is the URL of the station, `#` and
-    /// the ApplicationUri of the component.
+    /// The URL of the server. For a component behind a station it is the URL of the station, `#`
+    /// and the ApplicationUri of the component.
     pub endpoint: String,
     /// The skill.
     pub skill: FoundSkill,

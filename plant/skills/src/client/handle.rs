@@ -389,8 +389,8 @@ impl SkillHandle {
         }
     }
 
-    /// Returns whether the component has to be asked for the ends of runs: the values that a station
-    /// repeats may be older than the run.
+    /// Returns whether the component has to be asked for the ends of runs: the values that a
+    /// station repeats may be older than the run.
     fn asks_component(&self) -> bool {
         self.found.behind.is_some() && self.found.nodes.get("ReadOutcome").is_some()
     }

@@ -71,7 +71,8 @@ fn part(at: usize) -> String {
     text
 }
 
-/// Returns the index of the domain of a type: that of the nearest type of its chain which is listed.
+/// Returns the index of the domain of a type: that of the nearest type of its chain which is
+/// listed.
 fn domain(of: &'static SkillType) -> usize {
     let listed = |name: &str| DOMAINS.iter().position(|(_, types)| types.contains(&name));
     of.chain()
