@@ -69,6 +69,12 @@ fn the_actions_that_are_built_in_are_those_of_the_package() {
         let lines = lines.map(|line| format!("{line}\n"));
         wanted.push_str(&format!("action {name}\n{}", lines.collect::<String>()));
     }
+    // The services of the package, which are not of skills, follow the actions.
+    let services = now
+        .lines()
+        .skip_while(|line| !line.starts_with("service "))
+        .map(|line| format!("{line}\n"));
+    wanted.extend(services);
     assert_eq!(shipped(&path, &wanted), wanted, "{REFRESH}");
 }
 
