@@ -87,6 +87,8 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
         (&summary["messages"], &summary["slow_disk"]),
         (&json!(60), &json!(0))
     );
+    // Own probes are no messages that the socket lost.
+    assert_eq!(summary["full_socket"], json!(0), "{recorded}");
     assert!(recording.wait_for_end(SOON).success(), "{recording}");
 
     let (code, refused) = ended(&["replay", text(&packets)]);
