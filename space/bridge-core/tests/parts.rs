@@ -96,6 +96,20 @@ fn each_value_and_command_crosses_the_bridge_of_its_namespace() {
 }
 
 #[test]
+fn a_sample_of_the_start_waits_until_the_namespace_is_known_to_be_free() {
+    let mut cell = Cell::new(Vec::new());
+    let bridge = bridge(10_002, &mut cell, &[5]);
+    cell.programs.push(bridge);
+    cell.programs.push(Program::new(1, Local::Fields));
+    let (at, reader, latched) = (0, 1, topic(2, 5, 10));
+    cell.say(at, latched, "latched");
+    cell.run(ms(200));
+    assert_eq!(cell.texts(reader, latched), [] as [&str; 0]);
+    cell.run(ms(800));
+    assert_eq!(cell.texts(reader, latched), ["latched"]);
+}
+
+#[test]
 fn a_call_is_executed_and_offered_by_the_bridge_of_its_namespace() {
     let mut cell = plant(&[5], &[6]);
     let (weld, grip) = (topic(2, 6, 61), topic(0, 5, 105));

@@ -35,8 +35,7 @@ impl Values {
         if !self.may_cross(Side::Local, What::Value, topic) {
             return self.refuse(topic, Reason::Looped, String::new());
         }
-        if self.part.is_some() && !self.carries(topic.triple().1) {
-            // Another bridge of the space sends it.
+        if self.is_elsewhere(topic.triple().1) {
             return Verdict::Drop(Reason::SpaceTaken);
         }
         let mut encoded = Encoded {

@@ -103,6 +103,14 @@ impl Router {
 }
 
 impl Values {
+    /// Returns whether another bridge of the space carries the namespace. While that is unknown
+    /// after the start, samples wait in their queues.
+    pub(super) fn is_elsewhere(&self, namespace: u16) -> bool {
+        self.part
+            .as_ref()
+            .is_some_and(|part| !part.has(namespace) || self.claims.is_taken(namespace))
+    }
+
     /// Returns whether this program carries the namespace: no other bridge of its space does.
     pub(super) fn carries(&self, namespace: u16) -> bool {
         self.part
