@@ -422,8 +422,9 @@ const MOST_BYTES: usize = 4 << 20;
 /// The limits of the buffers for reuse.
 const MOST_SPARE: usize = 64;
 const LARGEST_SPARE: usize = 4096;
-/// The number of datagrams of other programs that are dropped in a row.
-const DROPPED_AT_ONCE: usize = 32;
+/// The number of datagrams of other programs that are dropped in a row: more than a socket holds,
+/// so that the heartbeat of a redundant bridge behind them is received before a takeover.
+const DROPPED_AT_ONCE: usize = 16_384;
 
 #[cfg(test)]
 mod tests;

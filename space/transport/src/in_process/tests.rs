@@ -209,6 +209,17 @@ fn neither_the_network_nor_the_process_keeps_the_other_waiting() {
     assert_eq!(ports.len(), 20);
 }
 
+#[test]
+fn a_message_behind_many_datagrams_of_the_process_is_received_at_once() {
+    let ([_one, mut two], _stranger, wire) = two_and_a_stranger();
+    // The kernel does not filter them.
+    for _ in 0..1_000 {
+        wire.send(b"inside", SocketAddr::from(([10, 0, 0, 1], 1)));
+    }
+    wire.send(b"heartbeat", SocketAddr::from(([10, 0, 0, 9], 9)));
+    assert_eq!(received(&mut two), [sent(b"heartbeat", 9)]);
+}
+
 #[derive(Default)]
 struct Count(AtomicUsize);
 
