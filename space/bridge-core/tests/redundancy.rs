@@ -515,6 +515,34 @@ fn a_bridge_that_is_active_again_has_the_states_for_late_joiners() {
 }
 
 #[test]
+fn a_server_that_is_active_again_repeats_no_value_that_its_clients_wrote_before() {
+    let mut world = World::new(CELL, 17);
+    for at in [A, B] {
+        world.programs[at].router.show_values_at_standby();
+    }
+    // Clients write to the active server only.
+    let write = |world: &mut World, at: usize, value: u32| {
+        let payload = [&[0, 1, 0, 0], &value.to_le_bytes()[..]].concat();
+        world.programs[at].local.push_back((topic(STATE), payload));
+    };
+    world.run(700);
+    write(&mut world, A, 5);
+    world.run(500);
+    world.programs[A].stopped = world.passed + 500;
+    world.run(3_000);
+    assert_eq!(
+        (world.role(A), world.role(B)),
+        (Role::Standby, Role::Active)
+    );
+    write(&mut world, B, 9);
+    world.run(2_500);
+    world.programs[B].is_dead = true;
+    world.run(3_000);
+    assert_eq!(world.role(A), Role::Active);
+    assert_eq!(world.values(STATE), [5, 9]);
+}
+
+#[test]
 fn a_state_that_changes_while_no_bridge_is_active_arrives() {
     let mut world = World::new(CELL, 3);
     world.run(700);

@@ -657,6 +657,13 @@ impl Values {
         }
     }
 
+    /// Returns whether clients of a server write the topic. They are connected to a single server;
+    /// values of other servers and reports of alarms reach all redundant servers.
+    fn is_written_by_clients(&self, topic: TopicId) -> bool {
+        let variable = self.mapping.variable(topic);
+        self.shows_values() && variable.is_some_and(|of| of.from.is_none() && !of.reports_alarms)
+    }
+
     fn empty_topic(&mut self, topic: TopicId, now: Now) {
         if self.is_home(topic) {
             return self.mute_own(topic);
@@ -724,8 +731,10 @@ impl Router {
         self.begin_term(now);
     }
 
-    /// Continues the sequence numbers of an own topic, and repeats its state.
+    /// Continues the sequence numbers of an own topic, and repeats its state. A state that clients
+    /// of a server wrote is forgotten: another server may have sent a newer value.
     fn continue_own(&mut self, at: Handle, now: Now) {
+        let is_written = self.values.is_written_by_clients(at.topic());
         let Some(Topic {
             role: Role::Ours(writer),
             queue,
@@ -739,16 +748,18 @@ impl Router {
             return;
         };
         while queue.pop().is_some() {}
+        if is_written {
+            writer.keep_nothing();
+        }
         writer.continue_after(SKIPPED);
         if writer.is_live() {
             writer.begin_round(now.monotonic);
         }
         *announce_at = announce_at.map(|_| now.monotonic);
-        let outdated = match lasting {
-            // The former active bridge may have sent it.
-            Lasting::Event => gate.as_mut().and_then(|gate| gate.drop_held()),
-            Lasting::State | Lasting::AsSource => None,
-        };
+        // The former active bridge may have sent it.
+        let is_outdated = is_written || *lasting == Lasting::Event;
+        let held = gate.as_mut().filter(|_| is_outdated);
+        let outdated = held.and_then(|gate| gate.drop_held());
         let repeats = writer.repeats();
         if repeats && !*ready {
             *ready = true;
