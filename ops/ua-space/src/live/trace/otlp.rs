@@ -104,20 +104,20 @@ impl Exporter<'_> {
                 }
                 Go::On
             };
-            let end = live.now() + period;
-            let mut listening = pin!(live.listen(end, &mut each));
-            let ended = loop {
-                tokio::select! {
-                    biased;
-                    ended = &mut listening => break ended?,
-                    () = &mut round, if !is_over => is_over = true,
+            // A request that takes longer than a period takes another one.
+            while !is_over {
+                let end = live.now() + period;
+                let mut listening = pin!(live.listen(end, &mut each));
+                let ended = loop {
+                    tokio::select! {
+                        biased;
+                        ended = &mut listening => break ended?,
+                        () = &mut round, if !is_over => is_over = true,
+                    }
+                };
+                if ended == Ended::Interrupted {
+                    return Ok(());
                 }
-            };
-            if ended == Ended::Interrupted {
-                return Ok(());
-            }
-            if !is_over {
-                round.await;
             }
         }
     }
