@@ -134,8 +134,12 @@ impl<T> PageParts<T> {
         }
     }
 
-    /// Returns the status of each run loop, and the reason why a program does not run.
-    pub(super) async fn answers(&self) -> PageAnswers<T> {
+    /// Returns the status of each run loop, and the reason why a program does not run. All run
+    /// loops are asked at once, so that several that hang cost no more time than one.
+    pub(super) async fn answers(&self) -> PageAnswers<T>
+    where
+        T: Send + 'static,
+    {
         let parts: Vec<(&'static str, PartState<T>)> = {
             let parts = self.read();
             let parts = parts.iter();
@@ -143,28 +147,36 @@ impl<T> PageParts<T> {
                 .map(|part| (part.program, part.state.clone()))
                 .collect()
         };
-        let (mut shown, mut expected) = (Vec::new(), 0);
+        let mut asked = Vec::new();
         for (program, state) in parts {
             match state {
                 PartState::Running(asks) => {
-                    expected += asks.len();
-                    for ask in &asks {
-                        match tokio::time::timeout(PATIENCE, answer(ask)).await {
-                            Ok(status) => shown.extend(status.map(ShownPart::Running)),
-                            Err(_) => shown.push(ShownPart::Down {
-                                program,
-                                why: format!("its run loop has not answered for {PATIENCE:?}"),
-                            }),
-                        }
-                    }
+                    let all = asks.into_iter().map(|ask| running_part(program, ask));
+                    asked.extend(all.map(tokio::spawn));
                 }
                 PartState::Down(why) => {
-                    expected += 1;
-                    shown.push(ShownPart::Down { program, why });
+                    let down = ShownPart::Down { program, why };
+                    asked.push(tokio::spawn(async move { Some(down) }));
                 }
             }
         }
+        let expected = asked.len();
+        let mut shown = Vec::new();
+        for part in asked {
+            shown.extend(part.await.ok().flatten());
+        }
         PageAnswers { shown, expected }
+    }
+}
+
+/// Returns the part of a run loop; `None` if it has ended.
+async fn running_part<T>(program: &'static str, ask: Ask<T>) -> Option<ShownPart<T>> {
+    match tokio::time::timeout(PATIENCE, answer(&ask)).await {
+        Ok(status) => status.map(ShownPart::Running),
+        Err(_) => Some(ShownPart::Down {
+            program,
+            why: format!("its run loop has not answered for {PATIENCE:?}"),
+        }),
     }
 }
 
@@ -269,6 +281,26 @@ mod tests {
         answering(&parts, 1, "bridge-ros1");
         let again = parts.answers().await.shown;
         assert!(again.iter().all(|part| part.not_ready().is_empty()));
+    }
+
+    #[tokio::test]
+    async fn a_run_loop_is_asked_while_another_has_not_answered() {
+        let parts = PageParts::<Fixed>::new(&["bridge-ros1"]);
+        let RunLoops { asks, mut requests } = loops(2);
+        parts.run("bridge-ros1", asks);
+        tokio::spawn(async move {
+            let [second, first] = requests.as_mut_slice() else {
+                panic!("two run loops");
+            };
+            let of_second = second.recv().await.unwrap();
+            let of_first = first.recv().await.unwrap();
+            for reply in [of_second, of_first] {
+                drop(reply.send(Fixed("bridge-ros1")));
+            }
+        });
+        let PageAnswers { shown, expected } = parts.answers().await;
+        assert_eq!((shown.len(), expected), (2, 2));
+        assert!(shown.iter().all(|part| part.not_ready().is_empty()));
     }
 
     #[tokio::test]
