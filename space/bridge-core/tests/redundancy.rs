@@ -514,17 +514,27 @@ fn a_bridge_that_is_active_again_has_the_states_for_late_joiners() {
     assert_eq!(of_a(&world).last(), Some(&(70, Kept::Again)));
 }
 
+/// Two redundant servers, whose clients write [`STATE`].
+fn servers(text: &str, seed: u64) -> World {
+    let mut world = World::new(text, seed);
+    for at in [A, B] {
+        let now = world.now(at);
+        let router = &mut world.programs[at].router;
+        router.show_values_at_standby();
+        router.set_live(topic(STATE), true, now);
+    }
+    world
+}
+
+/// Writes a value as a client of a server. Clients write to the active server only.
+fn write(world: &mut World, at: usize, value: u32) {
+    let payload = [&[0, 1, 0, 0], &value.to_le_bytes()[..]].concat();
+    world.programs[at].local.push_back((topic(STATE), payload));
+}
+
 #[test]
 fn a_server_that_is_active_again_repeats_no_value_that_its_clients_wrote_before() {
-    let mut world = World::new(CELL, 17);
-    for at in [A, B] {
-        world.programs[at].router.show_values_at_standby();
-    }
-    // Clients write to the active server only.
-    let write = |world: &mut World, at: usize, value: u32| {
-        let payload = [&[0, 1, 0, 0], &value.to_le_bytes()[..]].concat();
-        world.programs[at].local.push_back((topic(STATE), payload));
-    };
+    let mut world = servers(CELL, 17);
     world.run(700);
     write(&mut world, A, 5);
     world.run(500);
@@ -540,6 +550,22 @@ fn a_server_that_is_active_again_repeats_no_value_that_its_clients_wrote_before(
     world.run(3_000);
     assert_eq!(world.role(A), Role::Active);
     assert_eq!(world.values(STATE), [5, 9]);
+}
+
+#[test]
+fn a_robot_stops_when_the_active_server_ends_with_the_session_of_its_commander() {
+    let text = CELL.replace(
+        "queue: keep_latest, ros: [{topic: /b",
+        "queue: keep_latest, on_loss: {data: 0}, ros: [{topic: /b",
+    );
+    let mut world = servers(&text, 18);
+    world.run(700);
+    write(&mut world, A, 5);
+    world.run(2_500);
+    world.programs[A].is_dead = true;
+    world.run(5_000);
+    assert_eq!(world.role(B), Role::Active);
+    assert_eq!(world.values(STATE), [5, 0]);
 }
 
 #[test]

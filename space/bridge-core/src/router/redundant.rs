@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use mappings::{Lasting, TopicId};
+use mappings::{Lasting, TopicId, Variable};
 use uadp::{MessageKind, NetworkMessage, NetworkMessageType, Timestamp};
 
 pub(super) use self::senders::ActiveSender;
@@ -657,11 +657,12 @@ impl Values {
         }
     }
 
-    /// Returns whether clients of a server write the topic. They are connected to a single server;
-    /// values of other servers and reports of alarms reach all redundant servers.
-    fn is_written_by_clients(&self, topic: TopicId) -> bool {
+    /// Returns the variable of a topic that clients of this server write. They are connected to a
+    /// single server; values of other servers and reports of alarms reach all redundant servers.
+    fn written_by_clients(&self, topic: TopicId) -> Option<&Variable> {
         let variable = self.mapping.variable(topic);
-        self.shows_values() && variable.is_some_and(|of| of.from.is_none() && !of.reports_alarms)
+        let written = variable.filter(|of| of.from.is_none() && !of.reports_alarms);
+        written.filter(|_| self.shows_values())
     }
 
     fn empty_topic(&mut self, topic: TopicId, now: Now) {
@@ -734,7 +735,9 @@ impl Router {
     /// Continues the sequence numbers of an own topic, and repeats its state. A state that clients
     /// of a server wrote is forgotten: another server may have sent a newer value.
     fn continue_own(&mut self, at: Handle, now: Now) {
-        let is_written = self.values.is_written_by_clients(at.topic());
+        let written = self.values.written_by_clients(at.topic());
+        let is_written = written.is_some();
+        let stops = written.is_some_and(|of| of.loss.is_some());
         let Some(Topic {
             role: Role::Ours(writer),
             queue,
@@ -750,6 +753,10 @@ impl Router {
         while queue.pop().is_some() {}
         if is_written {
             writer.keep_nothing();
+        }
+        if stops {
+            // Its commander had a session with the former active server.
+            writer.set_live(false);
         }
         writer.continue_after(SKIPPED);
         if writer.is_live() {
