@@ -108,7 +108,7 @@ fn the_md5_of_every_service_of_the_bundle_is_the_one_genpy_computed() {
         assert_eq!(service.md5(), table[&known.to_string()], "{known}");
         assert_eq!(service.request().name(), &name(&format!("{known}Request")));
     }
-    assert_eq!(registry.services().count(), 14);
+    assert_eq!(registry.services().count(), 15);
 }
 
 #[test]
