@@ -317,6 +317,15 @@ fn identity(config: &ClientConfig) -> IdentityToken {
     }
 }
 
+/// Returns what a keep-alive of a session means for its server.
+fn kept_alive(activity: &SessionActivity) -> Activity {
+    match activity {
+        SessionActivity::KeepAliveSucceeded => Activity::KeptAlive,
+        SessionActivity::KeepAliveFailed(StatusCode::BadTimeout) => Activity::Missed,
+        SessionActivity::KeepAliveFailed(_) => Activity::NotRunning,
+    }
+}
+
 async fn connect(
     shared: &Shared,
     client: &opcua::client::Client,
@@ -350,11 +359,7 @@ async fn connect(
         let reason = loop {
             let happened = match events.try_next().await {
                 Ok(Some(SessionPollResult::Reconnected(_))) => Activity::Connected,
-                Ok(Some(SessionPollResult::SessionActivity(activity))) => match activity {
-                    SessionActivity::KeepAliveSucceeded => Activity::KeptAlive,
-                    SessionActivity::KeepAliveFailed(StatusCode::BadTimeout) => Activity::Missed,
-                    SessionActivity::KeepAliveFailed(_) => Activity::NotRunning,
-                },
+                Ok(Some(SessionPollResult::SessionActivity(activity))) => kept_alive(&activity),
                 Ok(Some(SessionPollResult::Subscription(SubscriptionActivity::Publish))) => {
                     Activity::Published
                 }
