@@ -158,7 +158,7 @@ type Registration<'r> = (&'r dyn Fn(&[Variant]), Option<Awaited>);
 impl OnItsWay {
     /// Waits until the value has been sent.
     async fn left(self) -> Result<oneshot::Receiver<StatusCode>, StatusCode> {
-        // The sender is dropped when the server stops.
+        // The sender is dropped when the server stops or is not the active one any more.
         match tokio::time::timeout(LONGEST_WAY_OUT, self.gone_out).await {
             Ok(Ok(())) => Ok(self.answered),
             Ok(Err(_)) => Err(StatusCode::BadShutdown),

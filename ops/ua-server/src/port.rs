@@ -293,17 +293,18 @@ impl Port for ServerPort {
             tokio::select! {
                 Some(write) = self.writes.recv() => {
                     let ClientWrite { topic, block, source, commander, room, gone_out, answer, awaited } = write;
+                    if self.role.is_standby() {
+                        // The role has changed since the client wrote. Its write fails, because
+                        // `gone_out` is dropped.
+                        let (reason, why) = (Reason::Takeover, "standby");
+                        return PortEvent::Lost { topic: Some(topic), reason, why, count: 1 };
+                    }
                     self.commanders.wrote(topic, commander);
                     drop(room);
                     self.leaving = Some(gone_out);
                     self.confirms.supersede(topic);
                     self.confirms.arrivals.sent(topic, awaited);
-                    if self.role.is_standby() {
-                        // The role has changed since the client wrote: the Router drops the value.
-                        let _gone = answer.send(StatusCode::BadInvalidState);
-                    } else {
-                        self.others.sources.write(topic, &block, answer);
-                    }
+                    self.others.sources.write(topic, &block, answer);
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
