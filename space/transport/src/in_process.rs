@@ -246,7 +246,7 @@ impl<N: HubNetwork> Carrier for InProcess<N> {
         for _ in 0..DROPPED_AT_ONCE {
             match self.network.poll_recv(cx, buffer) {
                 Poll::Ready(Ok(received)) if self.network.is_companion(received.from) => {}
-                other => return other,
+                other @ (Poll::Ready(_) | Poll::Pending) => return other,
             }
         }
         cx.waker().wake_by_ref();

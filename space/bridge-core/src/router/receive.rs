@@ -116,12 +116,8 @@ impl Router {
                 }
                 (true, Some(_)) => {
                     let cause = (Reason::CallRefused, "chunk");
-                    self.values.count(About::sender(from), cause, 1, || {
-                        format!(
-                            "{from} is another host, and no call of the namespace is open to other hosts \
-                             (`open: true`)"
-                        )
-                    });
+                    let about = About::sender(from);
+                    self.values.count(about, cause, 1, || closed_to(from));
                 }
                 _ if self.follow_peer(message, namespace, from, now) => {}
                 _ if is_request && is_muted => {
@@ -253,6 +249,21 @@ impl Values {
         })
     }
 
+    /// Shows a received DataSetMessage to the tap of its topic.
+    fn note_received(&mut self, topic: TopicId, message: &DataSetMessage<'_>, from: SocketAddr) {
+        self.tap.note(topic, || Crossing::Received {
+            from,
+            sequence: message.sequence_number(),
+            keep_alive: message.kind == MessageKind::KeepAlive,
+        });
+        let refused = match self.forwarding {
+            Forwarding::None => return,
+            Forwarding::Forwarded => None,
+            Forwarding::Refused(reason) => Some(reason),
+        };
+        self.tap.note(topic, || Crossing::Forwarded { refused });
+    }
+
     /// Handles a DataSetMessage of another space: checks its sequence, and processes its content if
     /// it is new.
     pub(super) fn handle_message(
@@ -263,19 +274,7 @@ impl Values {
         now: Now,
     ) {
         let about = About::message(topic, from);
-        self.tap.note(topic, || Crossing::Received {
-            from,
-            sequence: message.sequence_number(),
-            keep_alive: message.kind == MessageKind::KeepAlive,
-        });
-        let refused = match self.forwarding {
-            Forwarding::None => None,
-            Forwarding::Forwarded => Some(None),
-            Forwarding::Refused(reason) => Some(Some(reason)),
-        };
-        if let Some(refused) = refused {
-            self.tap.note(topic, || Crossing::Forwarded { refused });
-        }
+        self.note_received(topic, message, from);
         if !message.is_valid() {
             return self.count(about, Reason::Invalid, 1, || {
                 "the writer marked its DataSetMessage as invalid".to_owned()
@@ -681,3 +680,10 @@ const fn reason_of(error: &DecodeError) -> Reason {
 const MISSED_ROUNDS: u32 = 3;
 /// The minimum time between two requests to the port for the type of a topic.
 const ASK_AGAIN: Duration = Duration::from_secs(1);
+
+/// Returns why a large request of another host is not executed.
+fn closed_to(from: SocketAddr) -> String {
+    format!(
+        "{from} is another host, and no call of the namespace is open to other hosts (`open: true`)"
+    )
+}

@@ -246,14 +246,7 @@ impl Router {
         let since = calls.since_start(now);
         let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
         let judged = match is_redundant && request.target_id == LASTING_TARGET {
-            true => Err((
-                Refusal::NotExecutable,
-                "no ActionTargetId",
-                format!(
-                    "{from} sent a request with the ActionTargetId {LASTING_TARGET}, and redundant bridges execute \
-                     only requests with their announced ActionTargetId"
-                ),
-            )),
+            true => Err(without_target(from)),
             false => may_be_executed(own, request, (from, group), known),
         };
         let verdict = judged.as_ref().map(|_| ()).map_err(|refused| refused.0);
@@ -562,3 +555,12 @@ const MAX_TIMEOUT: Duration = Duration::from_secs(3600);
 const START_WITHIN: Duration = Duration::from_millis(50);
 /// The time after its deadline at which an execution is removed.
 const FORGOTTEN: Duration = Duration::from_secs(60);
+
+/// Returns the refusal of a request without an announced ActionTargetId, its case and a text.
+fn without_target(from: SocketAddr) -> (Refusal, &'static str, String) {
+    let text = format!(
+        "{from} sent a request with the ActionTargetId {LASTING_TARGET}, and redundant bridges execute only \
+         requests with their announced ActionTargetId"
+    );
+    (Refusal::NotExecutable, "no ActionTargetId", text)
+}
