@@ -5,6 +5,7 @@ mod announce;
 mod announcements;
 mod batch;
 mod by_name;
+mod call_api;
 mod calls;
 mod chunks;
 mod claims;
@@ -30,11 +31,10 @@ mod send;
 mod told;
 mod values;
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-use mappings::{Mapping, SpaceId, TopicId};
+use mappings::{Mapping, TopicId};
 use messages::{MessageType, PlanError, Selection};
 use uadp::Timestamp;
 
@@ -42,8 +42,8 @@ use self::about::About;
 use self::announcements::Announcements;
 use self::calls::Calls;
 use self::reassembly::Reassembly;
-use self::redundant::ActiveSender;
 pub use self::redundant::MutedSamples;
+use self::redundant::RedundantSenders;
 use self::security::Security;
 use self::values::Values;
 use crate::confirm::Handover;
@@ -121,7 +121,7 @@ pub struct Router {
     /// Secured groups.
     security: Security,
     /// The redundant bridges of other spaces.
-    redundant_senders: BTreeMap<SpaceId, ActiveSender>,
+    redundant_senders: RedundantSenders,
     /// The bridges of other spaces that carry a part of their space.
     other_parts: OtherParts,
     /// Whether a value was polled before a call last time.
@@ -143,7 +143,7 @@ impl Router {
             calls: None,
             instance: [0; 16],
             security,
-            redundant_senders: BTreeMap::new(),
+            redundant_senders: RedundantSenders::default(),
             other_parts: OtherParts::default(),
             value_first: false,
         }
@@ -221,7 +221,7 @@ impl Router {
             self.values.schedule(at);
         }
         self.look_at_claims(now);
-        self.look_at_calls(now);
+        self.call_traffic().look_at_calls(now);
         self.inquire(now);
         self.announce_due(now);
         self.reassembly.expire(&mut self.values, now);

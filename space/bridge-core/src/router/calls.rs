@@ -17,24 +17,24 @@ use std::time::{Duration, Instant};
 use mappings::{SpaceId, TopicId};
 use messages::{ServiceType, Wire};
 use uadp::action::{
-    ActionAddress, ActionDialect, ActionFields, ActionKind, ActionMessage, ActionRequest,
-    ActionToSend, CallId, CallRefusal, ExecutionId, Outcome, Refusal, Requestor, RequestorSettings,
-    Responder, ResponderSettings, ResponseDrop, Unknown,
+    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, ActionToSend, CallId,
+    CallRefusal, ExecutionId, Outcome, Refusal, Requestor, RequestorSettings, Responder,
+    ResponderSettings, ResponseDrop, Unknown,
 };
-use uadp::{
-    EncodeError, Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, PublisherId, StatusCode,
-};
+use uadp::{EncodeError, Extras, NetworkHeader, OwnedPublisherId, PublisherId, StatusCode};
 
 use self::chunks::{Chunking, Of};
 use self::execute::{Own, Running};
 use self::learn::{Group, Known};
-use super::{About, Router};
+use super::announcements::Announcements;
+use super::redundant::RedundantSenders;
+use super::security::Security;
+use super::{About, Values};
 use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap};
 use crate::call_announcement::LASTING_TARGET;
 use crate::call_plan::CallPlan;
 use crate::counters::{Cause, Reason};
 use crate::fields;
-use crate::late;
 use crate::loop_rule::{Side, What};
 use crate::output::Output;
 use crate::settings::{Local, Now};
@@ -68,6 +68,17 @@ pub(super) struct Calls {
     look_at: Option<Instant>,
     /// The time of the next action.
     due: Option<Instant>,
+}
+
+/// The calls of a Router with the parts of the Router that they use.
+pub(super) struct CallTraffic<'r> {
+    pub(super) calls: &'r mut Option<Box<Calls>>,
+    pub(super) values: &'r mut Values,
+    pub(super) announcements: &'r mut Announcements,
+    pub(super) security: &'r Security,
+    pub(super) senders: &'r RedundantSenders,
+    /// Random bytes that distinguish own requests from requests of other programs.
+    pub(super) instance: [u8; 16],
 }
 
 /// The state of a call.
@@ -160,6 +171,29 @@ impl Calls {
         self.due
     }
 
+    /// Returns the counters of each call.
+    pub(super) fn counters(&self) -> impl Iterator<Item = (TopicId, &CallCounters)> {
+        let all = self.table.iter();
+        all.map(|(topic, call)| (*topic, &call.counters))
+    }
+
+    /// Returns the description of a call of another program, if the call has an executor.
+    pub(super) fn described(&self, topic: TopicId) -> Option<&Arc<CallDescription>> {
+        let known = self.table.get(&topic)?.known.as_ref()?;
+        (!known.gone).then_some(&known.description)
+    }
+
+    /// Returns whether a chunk of a request or response waits for the pace.
+    pub(super) fn is_chunking(&self) -> bool {
+        !self.chunking.is_empty()
+    }
+
+    /// Returns the own calls.
+    pub(super) fn own(&self) -> impl Iterator<Item = TopicId> {
+        let own = self.table.iter().filter(|(_, call)| call.own.is_some());
+        own.map(|(topic, _)| *topic)
+    }
+
     fn topic_of(&self, id: CallId) -> Option<TopicId> {
         self.asked.get(&id).map(|asked| asked.topic)
     }
@@ -175,15 +209,7 @@ impl Calls {
     }
 }
 
-impl Router {
-    /// Sets the random bytes of this program instance. They are used to seal messages in secured
-    /// groups, and to distinguish own requests from requests of other programs of the space and of
-    /// earlier instances. Call it before the first call is known.
-    pub fn set_instance(&mut self, instance: [u8; 16]) {
-        self.instance = instance;
-        self.security.set_instance(instance);
-    }
-
+impl CallTraffic<'_> {
     fn calls_mut(&mut self, now: Now) -> &mut Calls {
         let (own, instance) = (self.values.settings.own, self.instance);
         let timeout = self.values.mapping.pubsub().receive_timeout;
@@ -193,18 +219,8 @@ impl Router {
         })
     }
 
-    /// Returns the counters of each call that is known, requested or executed, in no particular
-    /// order.
-    pub fn calls(&self) -> impl Iterator<Item = (TopicId, &CallCounters)> {
-        let all = self.calls.iter().flat_map(|calls| &calls.table);
-        all.map(|(topic, call)| (*topic, &call.counters))
-    }
-
-    /// Returns the description of a call of another program, if the call has an executor.
-    #[must_use]
-    pub fn described_call(&self, topic: TopicId) -> Option<&Arc<CallDescription>> {
-        let known = self.calls.as_ref()?.table.get(&topic)?.known.as_ref()?;
-        (!known.gone).then_some(&known.description)
+    fn described_call(&self, topic: TopicId) -> Option<&Arc<CallDescription>> {
+        self.calls.as_ref()?.described(topic)
     }
 
     /// Binds a call to the service type with which the local side requests it. `map` assigns fields
@@ -214,7 +230,7 @@ impl Router {
     /// # Errors
     /// Returns the reason for users if the known call does not fit the type. The call stays bound
     /// nevertheless, because its description may change.
-    pub fn bind_call(
+    pub(super) fn bind_call(
         &mut self,
         topic: TopicId,
         (service, map): (&Arc<ServiceType>, &Arc<CallMap>),
@@ -266,7 +282,7 @@ impl Router {
     }
 
     /// Unbinds a call. Pending requests are still answered.
-    pub fn unbind_call(&mut self, topic: TopicId) {
+    pub(super) fn unbind_call(&mut self, topic: TopicId) {
         let calls = self.calls.as_mut();
         if let Some(call) = calls.and_then(|calls| calls.table.get_mut(&topic)) {
             call.bound = None;
@@ -275,7 +291,7 @@ impl Router {
 
     /// Records that the local side has a client for a call. If the call is not known, its executor
     /// is probed.
-    pub fn want_call(&mut self, topic: TopicId, now: Now) {
+    pub(super) fn want_call(&mut self, topic: TopicId, now: Now) {
         if self.described_call(topic).is_none() && !self.values.is_home(topic) {
             self.announcements.probe(topic, now);
         }
@@ -283,7 +299,7 @@ impl Router {
 
     /// Sends a request. The outcome is output as [`Output::Answer`] within `timeout` or soon after,
     /// unless the request is [given up](Self::give_up). Each `ask` is used once.
-    pub fn ask(
+    pub(super) fn ask(
         &mut self,
         ask: AskId,
         (topic, request): (TopicId, &[u8]),
@@ -291,7 +307,7 @@ impl Router {
         now: Now,
     ) {
         let (_, namespace, _) = topic.triple();
-        let begun = if self.is_muted_now(now) {
+        let begun = if self.values.is_muted() {
             Err(takeover::not_asked(self.values.shows_values()))
         } else if self.values.carries(namespace) {
             self.begin(topic, request, timeout, now)
@@ -414,7 +430,7 @@ impl Router {
     }
 
     /// Gives up a request. It has no outcome, and its executor is informed.
-    pub fn give_up(&mut self, ask: AskId, now: Now) {
+    pub(super) fn give_up(&mut self, ask: AskId, now: Now) {
         let Some(calls) = &mut self.calls else {
             return;
         };
@@ -427,67 +443,12 @@ impl Router {
     }
 
     /// Records that a request or response could not be sent. It is sent again.
-    pub fn not_called(&mut self, topic: TopicId, reason: Reason, detail: &str) {
+    pub(super) fn not_called(&mut self, topic: TopicId, reason: Reason, detail: &str) {
         self.count_call(topic, None, (reason, "socket"), || detail.to_owned());
     }
 
-    /// Handles the requests and responses in a message from or to the Publisher of `space`.
-    pub(super) fn handle_actions(
-        &mut self,
-        message: &NetworkMessage<'_>,
-        (space, from): (SpaceId, SocketAddr),
-        now: Now,
-    ) {
-        let actions = match message.actions(ActionDialect::Standard) {
-            Ok(actions) => actions,
-            Err(error) => return self.values.drop_undecoded(None, from, &error),
-        };
-        for action in actions {
-            let action = match action {
-                Ok(action) => action,
-                Err(error) => {
-                    self.values.drop_undecoded(None, from, &error);
-                    continue;
-                }
-            };
-            let namespace = action.writer_group_id.unwrap_or_default();
-            let topic = TopicId::new(u16::from(space.get()), namespace, action.writer_id);
-            if self.values.part.is_some() && !self.values.carries(namespace) {
-                continue;
-            }
-            match (topic, action.action.kind) {
-                (None, _) => {
-                    self.values
-                        .count(About::sender(from), Reason::NotInSpace, 1, String::new)
-                }
-                (Some(topic), ActionKind::Request) if self.values.is_untimed(&message.header()) => {
-                    let cause = late::cause(late::UNTIMED);
-                    self.count_call(topic, Some(from), cause, || late::NO_TIME.to_owned());
-                }
-                (Some(topic), ActionKind::Request)
-                    if self
-                        .values
-                        .is_given_up(&message.header(), action.action.timeout(), now) =>
-                {
-                    let cause = late::cause(late::GIVEN_UP);
-                    self.count_call(topic, Some(from), cause, || {
-                        "its caller has stopped waiting".to_owned()
-                    });
-                }
-                (Some(topic), ActionKind::Request) => {
-                    self.handle_request(topic, &action, from, now);
-                }
-                (Some(_), ActionKind::Response)
-                    if self.is_confirmation(&action, (space, from), now) => {}
-                (Some(topic), ActionKind::Response) => {
-                    self.handle_response(topic, &action, from, now);
-                }
-            }
-        }
-        self.settle(now);
-    }
-
-    fn handle_response(
+    /// Handles a response.
+    pub(super) fn handle_response(
         &mut self,
         topic: TopicId,
         response: &ActionMessage<'_>,
@@ -495,13 +456,13 @@ impl Router {
         now: Now,
     ) {
         if !self.values.may_cross(Side::Ua, What::Response, topic) {
-            if self.is_redundant_peer(from) {
+            if self.values.is_redundant_peer(from) {
                 return;
             }
             let (_, namespace, _) = topic.triple();
             return self.values.drop_own(Some(namespace), from, now);
         }
-        let is_successor = self.is_active_sender(topic.space, from);
+        let is_successor = self.senders.is_active(self.security, (topic.space, from));
         let Some(calls) = &mut self.calls else {
             return self
                 .values
@@ -690,8 +651,8 @@ impl Router {
         }
     }
 
-    /// Counts a drop of a call as [`count`](Self::count) does for a topic.
-    fn count_call(
+    /// Counts a drop of a call as `Values::count` does for a topic.
+    pub(super) fn count_call(
         &mut self,
         topic: TopicId,
         from: Option<SocketAddr>,

@@ -78,7 +78,10 @@ impl Router {
         let counts = confirmer.is_some_and(|of| of.counts(from, now.monotonic));
         let (_, namespace, _) = topic.triple();
         let is_carrier = self.other_parts.is_carrier((space, namespace), from);
-        if !counts && !is_carrier && !self.is_active_sender(space, from) {
+        let is_active = self
+            .redundant_senders
+            .is_active(&self.security, (space, from));
+        if !counts && !is_carrier && !is_active {
             // The announcement of the bridge may have been lost.
             self.announcements.probe_applications(now);
             let cause = (Reason::Forged, "confirmation");

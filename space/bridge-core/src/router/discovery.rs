@@ -129,7 +129,7 @@ impl Router {
         if message.message_type() == NetworkMessageType::Probe {
             self.handle_probe(message, (space, from), now);
         } else if space == own
-            && (self.is_redundant_peer(from) || self.values.part.is_some())
+            && (self.values.is_redundant_peer(from) || self.values.part.is_some())
             && !self.values.is_source(from)
         {
             // Another bridge of the space announces its own part, or what this program announces
@@ -168,7 +168,7 @@ impl Router {
                 // It is also used as a probe for calls.
                 self.announcements.handle_roll(space, now);
                 if space == own {
-                    self.announce_calls(now);
+                    self.call_traffic().announce_calls(now);
                 }
             }
             Ok(probe @ (Probe::PublisherEndpoints | Probe::FindApplications)) => {
@@ -190,7 +190,9 @@ impl Router {
         now: Now,
     ) {
         match &announcement.announced {
-            Announced::ActionMetaData(action) => self.learn_call(action, (space, from), now),
+            Announced::ActionMetaData(action) => {
+                self.call_traffic().learn_call(action, (space, from), now);
+            }
             Announced::ApplicationDescription {
                 description,
                 capabilities,
@@ -207,7 +209,7 @@ impl Router {
             } => {
                 let named = meta_data.name.and_then(split_name);
                 let namespace = named.map(|(topic, _)| topic.triple().1);
-                if self.is_unsaid(namespace, from) {
+                if self.values.is_unsaid(&self.security, namespace, from) {
                     return;
                 }
                 self.learn_value((*writer_id, *status), meta_data, (space, from), now);
@@ -242,8 +244,9 @@ impl Router {
         match topic {
             Some(topic) if bad => {
                 self.values.unlearn(topic, from, now);
-                self.unlearn_call(topic, from);
-                self.settle(now);
+                let mut calls = self.call_traffic();
+                calls.unlearn_call(topic, from);
+                calls.settle(now);
             }
             Some(topic) => {
                 let announcements = &mut self.announcements;

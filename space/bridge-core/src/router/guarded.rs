@@ -4,7 +4,8 @@ use std::net::SocketAddr;
 
 use uadp::{KeyError, NetworkMessage};
 
-use super::{About, Router};
+use super::security::Security;
+use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::guard::{GroupState, KeyDelivery, Unopened};
 use crate::output::Output;
@@ -61,15 +62,22 @@ impl Router {
             self.values.tell(Output::KeysWanted { group });
         }
     }
+}
 
+impl Values {
     /// Returns whether the current message is unsecured but concerns a secured namespace, and
     /// counts it.
-    pub(super) fn is_unsaid(&mut self, namespace: Option<u16>, from: SocketAddr) -> bool {
-        let unsaid = self.security.is_unsaid(namespace);
+    pub(super) fn is_unsaid(
+        &mut self,
+        security: &Security,
+        namespace: Option<u16>,
+        from: SocketAddr,
+    ) -> bool {
+        let unsaid = security.is_unsaid(namespace);
         if unsaid {
             let cause = (Reason::Unsecured, "announcement");
             let about = About::sender(from);
-            self.values.count(about, cause, 1, || match namespace {
+            self.count(about, cause, 1, || match namespace {
                 Some(namespace) => {
                     format!("it is not secured, but its namespace {namespace} is")
                 }

@@ -35,7 +35,7 @@ impl Router {
         for topic in moved {
             self.drop_topic(topic);
         }
-        self.sort_calls(now);
+        self.call_traffic().sort_calls(now);
         self.values.claims.retain(&self.values.owned);
     }
 
@@ -93,7 +93,7 @@ impl Router {
                 .announce_again(&mut self.values, topic, now);
             self.values.schedule(at);
         }
-        self.announce_calls(now);
+        self.call_traffic().announce_calls(now);
     }
 
     /// Removes a topic and stops its announcements.

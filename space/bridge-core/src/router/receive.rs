@@ -88,7 +88,11 @@ impl Router {
             self.handle_discovery(message, (space, from), now);
             return;
         }
-        if self.is_superseded(space, from, now) {
+        let sender = (space, from);
+        if self
+            .redundant_senders
+            .is_superseded(&mut self.values, sender, now)
+        {
             return;
         }
         if message.is_action() {
@@ -111,7 +115,7 @@ impl Router {
                 && message.writer_ids().is_none();
             let is_muted = self.values.is_muted();
             match (is_request && !is_muted, namespace) {
-                (true, Some(namespace)) if self.may_request(namespace, from) => {
+                (true, Some(namespace)) if self.call_traffic().may_request(namespace, from) => {
                     self.handle_chunk(message, (space, namespace), from, now);
                 }
                 (true, Some(_)) => {

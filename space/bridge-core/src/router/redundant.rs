@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use mappings::{Lasting, TopicId, Variable};
 use uadp::{MessageKind, NetworkMessage, NetworkMessageType, Timestamp};
 
-pub(super) use self::senders::ActiveSender;
+pub(super) use self::senders::RedundantSenders;
 use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::loop_rule::Owned;
@@ -110,10 +110,7 @@ impl Router {
     /// Returns the state of the redundancy; `None` for a program without redundancy.
     #[must_use]
     pub fn redundancy(&self) -> Option<&Redundancy> {
-        self.values
-            .redundant
-            .as_ref()
-            .map(|redundant| &redundant.state)
+        self.values.redundancy()
     }
 
     /// Returns whether another redundant bridge of the space publishes on the local side, or may
@@ -245,6 +242,16 @@ impl Router {
 }
 
 impl Values {
+    /// Returns the state of the redundancy.
+    pub(super) fn redundancy(&self) -> Option<&Redundancy> {
+        self.redundant.as_ref().map(|redundant| &redundant.state)
+    }
+
+    /// Returns whether the sender is another bridge of the own space.
+    pub(super) fn is_redundant_peer(&self, from: SocketAddr) -> bool {
+        self.redundancy().is_some_and(|state| state.is_peer(from))
+    }
+
     /// Returns whether nothing is sent to the group.
     pub(super) fn is_muted(&self) -> bool {
         let redundant = self.redundant.as_ref();
@@ -320,7 +327,8 @@ impl Router {
         // In space 0, other programs share the space with redundant servers.
         let is_shared = self.values.redundant.is_none() && self.values.owned != Owned::All;
         if space != self.values.settings.own || is_shared {
-            self.meet_redundant(space, heartbeat, from, now);
+            let at = (from, now.monotonic);
+            self.redundant_senders.meet(space, heartbeat, at);
             return true;
         }
         let Some(redundant) = &mut self.values.redundant else {
@@ -614,7 +622,7 @@ impl Router {
             redundant.unsure.clear();
             redundant.took_over = None;
         }
-        self.end_term(now);
+        self.call_traffic().end_term(now);
         for at in self.values.topics.handles() {
             self.values.mute_topic(at.topic(), now);
             self.values.withdraw_states(at);
@@ -729,7 +737,7 @@ impl Router {
         }
         // Its confirmations count after its announcement.
         self.announcements.plan_application(now);
-        self.begin_term(now);
+        self.call_traffic().begin_term(now);
     }
 
     /// Continues the sequence numbers of an own topic, and repeats its state. A state that clients

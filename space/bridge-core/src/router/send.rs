@@ -59,9 +59,10 @@ impl Router {
         let next = if self.value_first {
             self.values
                 .next_value(now)
-                .or_else(|| self.next_action(now))
+                .or_else(|| self.call_traffic().next_action(now))
         } else {
-            self.next_action(now)
+            self.call_traffic()
+                .next_action(now)
                 .or_else(|| self.values.next_value(now))
         };
         if next.is_none() {

@@ -10,7 +10,7 @@ use uadp::{
     PublisherId, Whole,
 };
 
-use super::Router;
+use super::CallTraffic;
 use crate::counters::Reason;
 use crate::output::Output;
 use crate::settings::Now;
@@ -148,7 +148,7 @@ impl Large {
     }
 }
 
-impl Router {
+impl CallTraffic<'_> {
     /// Returns the maximum size of a datagram in bytes.
     pub(super) fn most(&self) -> usize {
         self.values.sizes().0.into()
@@ -159,12 +159,6 @@ impl Router {
         if let Some(calls) = &mut self.calls {
             calls.chunking.push(topic, of, bytes);
         }
-    }
-
-    /// Returns whether a chunk of a request or response waits for the pace.
-    pub(in super::super) fn is_chunking(&self) -> bool {
-        let calls = self.calls.as_ref();
-        calls.is_some_and(|calls| !calls.chunking.is_empty())
     }
 
     /// Returns the next chunk if the pace allows it, alternating with the chunks of values.

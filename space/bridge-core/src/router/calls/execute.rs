@@ -10,15 +10,12 @@ use uadp::action::{
     ActionFields, ActionMessage, ExecutionId, FinishRefusal, Outcome, Refusal, RequestDrop,
     RequestOrigin, Requested,
 };
-use uadp::discovery::{Announced, Announcement, DataSetMetaDataType};
-use uadp::{Fields, PublisherId, SecurityHeader, StatusCode};
+use uadp::{Fields, StatusCode};
 
-use super::super::announce::BAD_NOT_FOUND;
+use super::super::About;
 use super::super::values::Values;
-use super::super::{About, Router};
-use crate::call::{
-    CallDescription, CallField, Executed, Execution, Offered, OfferedType, join_name,
-};
+use super::CallTraffic;
+use crate::call::{CallDescription, CallField, Executed, Execution, Offered, OfferedType};
 use crate::call_announcement::{CallAnnouncement, LASTING_TARGET, Types};
 use crate::call_plan::ExecutedPlan;
 use crate::counters::{Cause, Reason};
@@ -46,10 +43,10 @@ pub(super) struct Running {
     plan: Option<Arc<ExecutedPlan>>,
 }
 
-impl Router {
+impl CallTraffic<'_> {
     /// Adds or changes a call that the local side executes, and announces it. Calls of namespaces
     /// that this program does not own are ignored.
-    pub fn offer(&mut self, topic: TopicId, offered: Offered, now: Now) {
+    pub(in super::super) fn offer(&mut self, topic: TopicId, offered: Offered, now: Now) {
         let Offered { description, open } = offered;
         self.offer_as(topic, (&description, None), (open, None), now);
     }
@@ -60,7 +57,7 @@ impl Router {
     /// # Errors
     /// Returns the reason for users if the type cannot be executed, or if the payloads of the local
     /// side are fields.
-    pub fn offer_type(
+    pub(in super::super) fn offer_type(
         &mut self,
         topic: TopicId,
         offered: &OfferedType,
@@ -135,64 +132,11 @@ impl Router {
         }
     }
 
-    /// Removes an own call or value that the local side does not have any more, and announces the
-    /// removal. Running executions continue.
-    pub fn withdraw(&mut self, topic: TopicId, now: Now) {
-        if !self.values.is_home(topic) {
-            return;
-        }
+    /// Removes an own call. Running executions continue.
+    pub(in super::super) fn withdraw_own(&mut self, topic: TopicId) {
         let calls = self.calls.as_mut();
         if let Some(call) = calls.and_then(|calls| calls.table.get_mut(&topic)) {
             call.own = None;
-        }
-        self.unbind(topic, now);
-        self.announcements.forget(&mut self.values, topic);
-        let withheld = self.values.is_withheld(topic);
-        if !withheld {
-            self.announce_none(topic);
-        }
-    }
-
-    /// Removes all own calls, and all own values that are not in the mapping, before the end of the
-    /// program. Each is removed as in [`withdraw`](Self::withdraw).
-    pub fn withdraw_all(&mut self, now: Now) {
-        let calls = self.calls.iter().flat_map(|calls| &calls.table);
-        let calls = calls.filter(|(_, call)| call.own.is_some());
-        let said = self
-            .values
-            .topics
-            .iter()
-            .filter(|(_, entry)| entry.said.is_some());
-        let topics = calls
-            .map(|(topic, _)| *topic)
-            .chain(said.map(|(topic, _)| topic));
-        let topics: Vec<TopicId> = topics.collect();
-        for topic in topics {
-            self.withdraw(topic, now);
-        }
-    }
-
-    /// Announces that the topic does not exist.
-    fn announce_none(&mut self, topic: TopicId) {
-        let (space, _, writer_id) = topic.triple();
-        let announcement = Announcement {
-            sequence_number: 0,
-            announced: Announced::DataSetMetaData {
-                writer_id,
-                meta_data: DataSetMetaDataType {
-                    name: Some(&join_name(topic, "")),
-                    ..DataSetMetaDataType::default()
-                },
-                status: BAD_NOT_FOUND,
-            },
-        };
-        let mut bytes = self.values.buffer();
-        let publisher = PublisherId::UInt16(space);
-        if announcement
-            .encode(publisher, SecurityHeader::NONE, &mut bytes)
-            .is_ok()
-        {
-            self.values.tell(Output::Discovery { bytes });
         }
     }
 
@@ -212,7 +156,7 @@ impl Router {
 
     /// Handles a request, and passes it to the local side if it is for an own call and may be
     /// executed.
-    pub(super) fn handle_request(
+    pub(in super::super) fn handle_request(
         &mut self,
         topic: TopicId,
         request: &ActionMessage<'_>,
@@ -223,7 +167,7 @@ impl Router {
         {
             return self.count_call(topic, Some(from), Reason::NotAsked, String::new);
         }
-        if self.is_muted_now(now) {
+        if self.values.is_muted() {
             // Another bridge answers it.
             return self.count_call(
                 topic,
@@ -402,7 +346,12 @@ impl Router {
     }
 
     /// Ends an execution with its outcome, which is sent to the requestor.
-    pub fn executed(&mut self, execution: ExecutionId, outcome: Executed, now: Now) {
+    pub(in super::super) fn executed(
+        &mut self,
+        execution: ExecutionId,
+        outcome: Executed,
+        now: Now,
+    ) {
         let Some(calls) = &mut self.calls else {
             return;
         };

@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 use mappings::{SpaceId, TopicId};
 use uadp::discovery::ActionMetaData;
 
-use super::super::{About, Router};
-use super::Calls;
+use super::super::About;
+use super::{CallTraffic, Calls};
 use crate::call::{CallDescription, CallRole, split_name};
 use crate::call_announcement;
 use crate::counters::Reason;
@@ -157,7 +157,7 @@ impl Calls {
     }
 }
 
-impl Router {
+impl CallTraffic<'_> {
     /// Handles the announcement of a call of another program.
     pub(in super::super) fn learn_call(
         &mut self,
@@ -174,7 +174,7 @@ impl Router {
                 .count(About::sender(from), Reason::NotInSpace, 1, String::new);
         };
         let (_, namespace, _) = topic.triple();
-        if self.is_unsaid(Some(namespace), from) {
+        if self.values.is_unsaid(self.security, Some(namespace), from) {
             return;
         }
         if self.values.is_home(topic) {
@@ -211,7 +211,7 @@ impl Router {
     fn may_execute(&mut self, of: (SpaceId, u16), from: SocketAddr, now: Now) -> bool {
         let silences = self.silences();
         // The keys of the group show that a redundant bridge has taken over.
-        let is_successor = self.is_active_sender(of.0, from);
+        let is_successor = self.senders.is_active(self.security, (of.0, from));
         let Some(group) = self
             .calls
             .as_mut()

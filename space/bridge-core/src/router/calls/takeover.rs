@@ -5,41 +5,24 @@
 //! own, which requestors read in its announcements. A request to a former active bridge, which may
 //! have executed it, is answered as unknown.
 
-use std::net::SocketAddr;
-
 use mappings::TopicId;
 use uadp::StatusCode;
 use uadp::action::{CallId, Outcome, Refusal, Unknown};
 
-use super::Router;
+use super::CallTraffic;
 use crate::call::{AskError, AskErrorKind};
 use crate::call_announcement::{target_of, target_of_term};
 use crate::counters::{Cause, Reason};
 use crate::output::Output;
 use crate::settings::Now;
 
-impl Router {
+impl CallTraffic<'_> {
     /// Returns the ActionTargetId of the own calls in the present term.
     pub(super) fn target(&self) -> u16 {
-        match self.redundancy() {
+        match self.values.redundancy() {
             Some(state) => target_of_term(self.instance, state.rank(), state.counts().takeovers),
             None => target_of(self.instance),
         }
-    }
-
-    /// Returns whether this program may not send requests and responses at the moment, after a
-    /// check of its lease.
-    pub(super) fn is_muted_now(&mut self, now: Now) -> bool {
-        if self.values.redundant.is_none() {
-            return false;
-        }
-        self.check_lease(now);
-        self.values.is_muted()
-    }
-
-    /// Returns whether the sender is another bridge of the own space.
-    pub(in super::super) fn is_redundant_peer(&self, from: SocketAddr) -> bool {
-        self.redundancy().is_some_and(|state| state.is_peer(from))
     }
 
     /// Begins a term as the active bridge: announces the own calls before anything else is sent.
@@ -53,7 +36,7 @@ impl Router {
         let mut own: Vec<TopicId> = own.map(|(topic, _)| *topic).collect();
         own.sort_unstable();
         for topic in own.into_iter().take(MOST_AT_ONCE) {
-            calls.announce(&mut self.values, topic, 0, now);
+            calls.announce(self.values, topic, 0, now);
         }
         // All of them are announced once more, because an announcement may be lost.
         self.announce_calls(now);

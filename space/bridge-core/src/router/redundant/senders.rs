@@ -8,12 +8,19 @@ use mappings::SpaceId;
 
 use crate::counters::Reason;
 use crate::redundancy::Heartbeat;
-use crate::router::{About, Router};
+use crate::router::security::Security;
+use crate::router::{About, Values};
 use crate::settings::Now;
+
+/// The redundant bridges of other spaces.
+#[derive(Debug, Default)]
+pub(in crate::router) struct RedundantSenders {
+    of: BTreeMap<SpaceId, ActiveSender>,
+}
 
 /// The redundant bridges of another space.
 #[derive(Debug)]
-pub(in crate::router) struct ActiveSender {
+struct ActiveSender {
     heartbeat: Heartbeat,
     from: SocketAddr,
     at: Instant,
@@ -21,18 +28,15 @@ pub(in crate::router) struct ActiveSender {
     members: BTreeMap<u32, SocketAddr>,
 }
 
-impl Router {
-    /// Records the redundant bridges of another space.
-    pub(super) fn meet_redundant(
+impl RedundantSenders {
+    /// Records the heartbeat of a bridge of another space.
+    pub(super) fn meet(
         &mut self,
         space: SpaceId,
         heartbeat: Heartbeat,
-        from: SocketAddr,
-        now: Now,
+        (from, at): (SocketAddr, Instant),
     ) {
-        let at = now.monotonic;
-        let senders = self.redundant_senders.entry(space);
-        let sender = senders.or_insert_with(|| ActiveSender {
+        let sender = self.of.entry(space).or_insert_with(|| ActiveSender {
             heartbeat,
             from,
             at,
@@ -55,12 +59,12 @@ impl Router {
     /// Returns whether a redundant bridge of another space sends values although another bridge of
     /// the space is active: its message was under way at the takeover. Counts it.
     pub(in crate::router) fn is_superseded(
-        &mut self,
-        space: SpaceId,
-        from: SocketAddr,
+        &self,
+        values: &mut Values,
+        (space, from): (SpaceId, SocketAddr),
         now: Now,
     ) -> bool {
-        let Some(sender) = self.redundant_senders.get(&space) else {
+        let Some(sender) = self.of.get(&space) else {
             return false;
         };
         let is_known = sender.heartbeat.is_active()
@@ -71,7 +75,7 @@ impl Router {
         if is_superseded {
             let active = sender.from;
             let cause = (Reason::Takeover, "superseded");
-            self.values.count(About::sender(from), cause, 1, || {
+            values.count(About::sender(from), cause, 1, || {
                 format!("{active} is the active bridge of space {space}, and {from} sent a value")
             });
         }
@@ -80,11 +84,15 @@ impl Router {
 
     /// Returns whether the sender is known to be the active bridge of another space, because its
     /// heartbeat was secured as its message is.
-    pub(in crate::router) fn is_active_sender(&self, space: SpaceId, from: SocketAddr) -> bool {
-        let sender = self.redundant_senders.get(&space);
+    pub(in crate::router) fn is_active(
+        &self,
+        security: &Security,
+        (space, from): (SpaceId, SocketAddr),
+    ) -> bool {
+        let sender = self.of.get(&space);
         let is_active =
             sender.is_some_and(|sender| sender.from == from && sender.heartbeat.is_active());
-        is_active && self.security.is_authentic()
+        is_active && security.is_authentic()
     }
 }
 
