@@ -223,20 +223,57 @@ fn a_bridge_that_was_stopped_starts_nothing() {
     }
 }
 
-#[test]
-fn an_execution_that_waits_for_the_local_side_does_not_start_after_a_stop() {
-    let mut cell = plant(true);
-    // The request is handled, and the process stops before its output is taken.
+/// Returns the datagram of a request, which does not reach the bridges.
+fn request(cell: &mut Cell) -> Vec<u8> {
     let now = cell.now();
-    cell.programs[CALLER]
-        .router
-        .ask(AskId(1), (weld(), &seam(1)), ms(3_000), now);
+    let router = &mut cell.programs[CALLER].router;
+    router.ask(AskId(1), (weld(), &seam(1)), ms(3_000), now);
     let mut request = Vec::new();
-    while let Some(output) = cell.programs[CALLER].router.poll_output(now) {
+    while let Some(output) = router.poll_output(now) {
         if let bridge_core::Output::Action { bytes, .. } = output {
             request = bytes;
         }
     }
+    assert!(!request.is_empty());
+    request
+}
+
+#[test]
+fn a_request_after_the_end_of_the_lease_is_not_even_passed_on() {
+    for (pause, executed) in [(0, 1), (300, 0)] {
+        let mut cell = plant(true);
+        let request = request(&mut cell);
+        let from = cell.programs[CALLER].address;
+        cell.stop(A);
+        cell.run(ms(pause));
+        let now = cell.now();
+        let router = &mut cell.programs[A].router;
+        router.handle_datagram(&request, from, now);
+        let passed_on: u64 = router.calls().map(|(_, call)| call.executed).sum();
+        assert_eq!(passed_on, executed, "{pause} ms");
+    }
+}
+
+#[test]
+fn a_request_of_the_local_side_after_the_end_of_the_lease_is_unknown_at_once() {
+    for (pause, unknown) in [(0, 0), (300, 1)] {
+        let mut cell = plant(true);
+        cell.stop(A);
+        cell.run(ms(pause));
+        let now = cell.now();
+        let router = &mut cell.programs[A].router;
+        router.ask(AskId(1), (grip(), &seam(1)), ms(3_000), now);
+        let counted: u64 = router.calls().map(|(_, call)| call.unknown).sum();
+        assert_eq!(counted, unknown, "{pause} ms");
+    }
+}
+
+#[test]
+fn an_execution_that_waits_for_the_local_side_does_not_start_after_a_stop() {
+    let mut cell = plant(true);
+    // The request is handled, and the process stops before its output is taken.
+    let request = request(&mut cell);
+    let now = cell.now();
     let from = cell.programs[CALLER].address;
     let router = &mut cell.programs[A].router;
     router.handle_datagram(&request, from, now);
