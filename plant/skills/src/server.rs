@@ -219,8 +219,7 @@ impl ComponentServer {
         if let Some(extension) = &settings.extension {
             extension.serve(&server, &root.node_id, &mut ids)?;
         }
-        if let Some(node) = root.node("LeaseHolder") {
-            let node = node.clone();
+        if let Some(node) = root.node("LeaseHolder").cloned() {
             tasks.spawn(show_holder(server.clone(), node, authority.holder()));
         }
         Ok(Self {

@@ -54,13 +54,16 @@ pub(crate) fn open(
     Ok((open_udp(&options, hub)?, Some(options)))
 }
 
+/// Carriers, and the options of their first socket if one of them uses UDP.
+type WithOptions<T> = (T, Option<Options>);
+
 /// Opens the carriers of a list. Returns the options of the first socket too, if UDP is among them.
 fn open_all(
     listed: &[ConfiguredCarrier],
     identity: &Identity,
     arguments: &Arguments,
     (several, hub): (bool, Option<&ProcessHub>),
-) -> Result<(Vec<Box<dyn Carrier>>, Option<Options>), Failure> {
+) -> Result<WithOptions<Vec<Box<dyn Carrier>>>, Failure> {
     let mut carriers = Vec::new();
     let mut first = None;
     for ConfiguredCarrier { medium, .. } in listed {

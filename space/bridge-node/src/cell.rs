@@ -268,6 +268,15 @@ impl ProgramThread {
     }
 }
 
+/// Logs the failure of a program: as an error if only a change of its configuration helps.
+fn log_failure(program: &str, failure: &Failure, (next, is_refused): (&str, bool)) {
+    if is_refused {
+        error!(program, "{failure}; {next}");
+    } else {
+        warn!(program, "{failure}; {next}");
+    }
+}
+
 /// Runs a program, and starts it again after a failure, until the process is to end.
 async fn keep(
     program: SharedProgram,
@@ -297,23 +306,12 @@ async fn keep(
             failure.kind(),
             FailureKind::Usage | FailureKind::Configuration
         );
-        if is_refused {
-            error!(
-                program = name,
-                "{failure}; it is started again when the mapping changes"
-            );
-            host.failed(
-                name,
-                &failure,
-                "it is started again when the mapping changes",
-            );
-        } else {
-            warn!(
-                program = name,
-                "{failure}; it is started again in {pause:?}"
-            );
-            host.failed(name, &failure, &format!("it is started again in {pause:?}"));
-        }
+        let next = match is_refused {
+            true => "it is started again when the mapping changes".to_owned(),
+            false => format!("it is started again in {pause:?}"),
+        };
+        log_failure(name, &failure, (&next, is_refused));
+        host.failed(name, &failure, &next);
         let mut hangup = signals::listen(SignalKind::hangup())?;
         let again = async {
             match is_refused {

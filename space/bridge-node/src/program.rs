@@ -16,7 +16,7 @@ use tokio::signal::unix::SignalKind;
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tracing::{Instrument, Span, error, info, info_span};
-use transport::Held;
+use transport::{Carrier, Held};
 use type_files::TypePaths;
 
 use crate::arguments::Arguments;
@@ -350,18 +350,7 @@ async fn prepare<P: Program>(
     let mut keys = KeyRing::new(groups(arguments)?, program.key_service(&mapping));
     let taken = mapping;
     let mapping = keys.applied(Arc::clone(&taken));
-    let mut router = Router::new(settings, Arc::clone(&mapping));
-    router.set_owned(P::owned(&mapping), now());
-    router.set_relay(carrier::relay(carrier.as_ref()));
-    router.set_link(carrier::link(carrier.as_ref()));
-    identify(&mut router, program.rank())?;
-    if P::SHOWS_VALUES_AT_STANDBY {
-        router.show_values_at_standby();
-    }
-    let part = program.part();
-    if !part.is_empty() {
-        router.set_part(part, plain(P::NAME, own).name, now());
-    }
+    let mut router = router_of(program, settings, &mapping, carrier.as_ref())?;
     keys.start(&mapping, &mut router)?;
     router.call_the_roll(now());
     let context = Context {
@@ -415,6 +404,29 @@ async fn prepare<P: Program>(
         observer,
         _told: told,
     })
+}
+
+/// Returns the Router of a space, which has no keys yet.
+fn router_of<P: Program>(
+    program: &P,
+    settings: Settings,
+    mapping: &Arc<Mapping>,
+    carrier: &dyn Carrier,
+) -> Result<Router, Failure> {
+    let own = settings.own;
+    let mut router = Router::new(settings, Arc::clone(mapping));
+    router.set_owned(P::owned(mapping), now());
+    router.set_relay(carrier::relay(carrier));
+    router.set_link(carrier::link(carrier));
+    identify(&mut router, program.rank())?;
+    if P::SHOWS_VALUES_AT_STANDBY {
+        router.show_values_at_standby();
+    }
+    let part = program.part();
+    if !part.is_empty() {
+        router.set_part(part, plain(P::NAME, own).name, now());
+    }
+    Ok(router)
 }
 
 fn log_start<P: Program>(arguments: &Arguments, own: SpaceId, hash: &str) {

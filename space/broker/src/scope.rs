@@ -60,8 +60,10 @@ pub fn scope(message: &NetworkMessage<'_>) -> Option<MessageScope> {
     let triple = withdrawn.map(mappings::TopicId::triple);
     Some(MessageScope {
         publisher: address.publisher,
-        group: address.group.or(triple.map(|(_, group, _)| group)),
-        writer: address.writer.or(triple.map(|(_, _, writer)| writer)),
+        group: address.group.or_else(|| triple.map(|(_, group, _)| group)),
+        writer: address
+            .writer
+            .or_else(|| triple.map(|(_, _, writer)| writer)),
         role,
     })
 }

@@ -134,9 +134,8 @@ impl Router {
             return;
         }
         let Some(namespace) = namespace else {
-            self.values
-                .count(About::sender(from), Reason::NotInSpace, 1, String::new);
-            return;
+            let about = About::sender(from);
+            return self.values.count(about, Reason::NotInSpace, 1, String::new);
         };
         // A chunk without a payload header may belong to a response, and the responding program
         // need not send values.

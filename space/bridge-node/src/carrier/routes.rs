@@ -164,7 +164,7 @@ impl Routes {
         // This program may have been stopped for a while, and no receiver on UDP checks the age.
         let acts = content.is_command()
             || matches!(scope.role, MessageRole::Request | MessageRole::HiddenCall);
-        let judged = stores.or(acts.then_some(Broker::WITHIN));
+        let judged = stores.or_else(|| acts.then_some(Broker::WITHIN));
         // Probes are forwarded only to carriers of their publisher. The copy of a probe that
         // arrives at such a carrier may be a forwarded one.
         let is_echo = sight == Sight::Copy && self.is_at(path.carrier, scope.publisher);

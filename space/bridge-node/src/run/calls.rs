@@ -161,31 +161,30 @@ impl<P: Port> Shell<P> {
 
     /// Reports a namespace that another program writes, or that is free again.
     pub(super) fn taken(&mut self, namespace: u16, by: Option<std::net::SocketAddr>, name: &str) {
-        match by {
-            Some(by) if !name.is_empty() => {
-                let program = self.program;
-                let why = format!(
-                    "namespace {namespace} of space {} is carried by {name} ({by}) and by this {program}: this \
-                     program carries nothing in it; list it in --namespaces of one of them only",
-                    self.own
-                );
-                warn!("{why}");
-                self.taken.insert(namespace, why);
-            }
-            Some(by) => {
-                let why = format!(
-                    "namespace {namespace} of space {} is in use from {by}: this program publishes nothing \
-                     in it; give this program another namespace, or stop the other program",
-                    self.own
-                );
-                warn!("{why}");
-                self.taken.insert(namespace, why);
-            }
-            None => {
-                info!(namespace, "the namespace is free: publishing in it");
-                self.taken.remove(&namespace);
-            }
+        if let Some(by) = by {
+            let why = self.why_taken(namespace, by, name);
+            warn!("{why}");
+            self.taken.insert(namespace, why);
+        } else {
+            info!(namespace, "the namespace is free: publishing in it");
+            self.taken.remove(&namespace);
         }
         self.port.taken(namespace, by);
+    }
+
+    /// Returns why this program publishes nothing in a namespace that another program writes; `name`
+    /// is empty if the other program does not announce which namespaces it carries.
+    fn why_taken(&self, namespace: u16, by: std::net::SocketAddr, name: &str) -> String {
+        let (own, program) = (self.own, self.program);
+        if name.is_empty() {
+            return format!(
+                "namespace {namespace} of space {own} is in use from {by}: this program publishes nothing \
+                 in it; give this program another namespace, or stop the other program"
+            );
+        }
+        format!(
+            "namespace {namespace} of space {own} is carried by {name} ({by}) and by this {program}: this \
+             program carries nothing in it; list it in --namespaces of one of them only"
+        )
     }
 }

@@ -15,22 +15,15 @@ impl<P: Port> Shell<P> {
         match self.carrier.follow() {
             None => {}
             Some(CarrierChange::Lost(why)) => {
-                let lost = group_lost(why);
-                match self.carrier.lost() {
-                    Some(_) => warn!(
-                        "{lost}; this program waits for the network and transfers nothing until then"
-                    ),
-                    None => warn!("{lost}; the other carriers continue"),
-                }
+                let next = match self.carrier.lost() {
+                    Some(_) => {
+                        "this program waits for the network and transfers nothing until then"
+                    }
+                    None => "the other carriers continue",
+                };
+                warn!("{}; {next}", group_lost(why));
             }
-            Some(CarrierChange::Back(interface)) => {
-                if let Some(source) = self.carrier.source() {
-                    self.router.set_source(source);
-                }
-                // The probes of the start may have been lost.
-                self.router.call_the_roll(now());
-                info!(%interface, "the PubSub network is within reach again: sending and receiving");
-            }
+            Some(CarrierChange::Back(interface)) => self.group_is_back(&interface),
         }
         let late = self.carrier.overflowed();
         if late > 0 {
@@ -40,6 +33,15 @@ impl<P: Port> Shell<P> {
         // A broker may have another limit after each connection.
         self.router.set_relay(relay(self.carrier.as_ref()));
         self.router.set_link(link(self.carrier.as_ref()));
+    }
+
+    fn group_is_back(&mut self, interface: &str) {
+        if let Some(source) = self.carrier.source() {
+            self.router.set_source(source);
+        }
+        // The probes of the start may have been lost.
+        self.router.call_the_roll(now());
+        info!(%interface, "the PubSub network is within reach again: sending and receiving");
     }
 
     /// Returns the reasons why carriers are out of reach.
