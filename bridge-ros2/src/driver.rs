@@ -200,7 +200,7 @@ impl Driver {
         }
         match self.rings.poll() {
             Sockets::Quiet => found,
-            rung => rung,
+            rung @ (Sockets::Readable | Sockets::Gone) => rung,
         }
     }
 }
