@@ -301,13 +301,13 @@ impl ServerCopy {
 
     /// Returns all variables.
     pub(crate) fn variables(&self) -> Vec<CopiedVariable> {
-        let variables = self.nodes.iter().filter_map(|(path, found)| {
-            matches!(found.kind, Kind::Variable { .. }).then(|| CopiedVariable {
-                at_server: found.id.clone(),
-                shown: id(path),
-            })
+        let nodes = self.nodes.iter();
+        let variables = nodes.filter(|(_, found)| matches!(found.kind, Kind::Variable { .. }));
+        let copied = variables.map(|(path, found)| CopiedVariable {
+            at_server: found.id.clone(),
+            shown: id(path),
         });
-        variables.collect()
+        copied.collect()
     }
 
     /// Marks the values of all variables after the loss of the server: they have no value.
@@ -431,6 +431,10 @@ impl Identifiers {
         Some(QualifiedName::new(index, name.name.as_ref()))
     }
 
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "the other values contain no identifiers of nodes"
+    )]
     fn value(&self, value: Variant) -> Variant {
         match value {
             Variant::NodeId(node) => self.node(&node).unwrap_or_else(NodeId::null).into(),

@@ -429,7 +429,7 @@ impl Survey<'_> {
                 && id.namespace != 0
             {
                 *of = reference_to(types, id)
-                    .unwrap_or(TypeRef::Core(ObjectTypeId::BaseObjectType.into()));
+                    .unwrap_or_else(|| TypeRef::Core(ObjectTypeId::BaseObjectType.into()));
             }
         }
         Ok(())
@@ -455,7 +455,7 @@ impl Survey<'_> {
             let supertype = chain
                 .get(at + 1)
                 .and_then(|above| reference_to(&self.mirror.types, above))
-                .unwrap_or(TypeRef::Core(ObjectTypeId::BaseObjectType.into()));
+                .unwrap_or_else(|| TypeRef::Core(ObjectTypeId::BaseObjectType.into()));
             let key = TypeKey::of(self.name_of(&name), id);
             let named = NamedType { key, supertype };
             self.mirror.types.push((id.clone(), named));

@@ -57,9 +57,14 @@ pub(crate) fn run(arguments: Vec<OsString>) -> ExitCode {
         Err(usage) => {
             // Printing fails if stdout or stderr is closed.
             let _printed = usage.print();
-            return match usage.kind() {
-                ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => ExitCode::SUCCESS,
-                _ => ExitCode::from(USAGE),
+            let is_help = matches!(
+                usage.kind(),
+                ErrorKind::DisplayHelp | ErrorKind::DisplayVersion
+            );
+            return if is_help {
+                ExitCode::SUCCESS
+            } else {
+                ExitCode::from(USAGE)
             };
         }
     };

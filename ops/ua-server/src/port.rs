@@ -137,6 +137,10 @@ impl ServerPort {
     /// # Errors
     /// Returns an error if the mapping cannot be served, if the address cannot be bound, or if the
     /// certificate store cannot be used.
+    #[expect(
+        clippy::too_many_lines,
+        reason = "the parts of the server, in the order of their start"
+    )]
     pub(crate) fn start(mapping: &Arc<Mapping>, mut setup: Setup) -> Result<Self, Failure> {
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
         let role = ServerRole::new(setup.rank);

@@ -115,9 +115,11 @@ impl<'a> Request<'a> {
     /// Decodes the fields of a request.
     fn decoded(request: &'a [u8]) -> Option<Self> {
         let mut fields = Fields::parse(request).ok()?;
-        let mut text = || match fields.next()?.ok()? {
-            uadp::Variant::Scalar(Scalar::String(text)) => Some(text.unwrap_or_default()),
-            _ => None,
+        let mut text = || {
+            let uadp::Variant::Scalar(Scalar::String(text)) = fields.next()?.ok()? else {
+                return None;
+            };
+            Some(text.unwrap_or_default())
         };
         let (event, comment) = (text()?, text()?);
         fields.next().is_none().then_some(Self { event, comment })
