@@ -13,7 +13,7 @@ use crate::{shell::step, workspace::Workspace};
 const COLUMNS: usize = 100;
 /// The number of wider lines that remain: help texts of commands, descriptions in the schema of the
 /// mapping, examples and tables. The number may only fall.
-const WIDER: usize = 227;
+const WIDER: usize = 83;
 
 /// Returns whether no more comment lines than [`WIDER`] are wider than [`COLUMNS`]. Prints the
 /// counts per file otherwise.
