@@ -88,7 +88,7 @@ fn values_cross_both_ways_in_one_process_and_a_foreign_bridge_receives_each_once
         .start();
     eventually("both bridges run", SOON, || {
         let running = |program| part(program).filter(|part| part["mapping"].is_object());
-        running("bridge-ros1").and(running("bridge-ros2"))
+        running("bridge-ros1").and_then(|_| running("bridge-ros2"))
     });
     eventually("the foreign bridge runs", SOON, || metrics(METRICS_FOREIGN));
 

@@ -148,6 +148,7 @@ fn slowly(x: f64) -> Vec<(String, skills::Value)> {
 }
 
 #[test]
+#[expect(clippy::too_many_lines, reason = "one story of one component")]
 fn a_skill_is_run_and_followed_through_two_stations_until_its_component_is_lost() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -295,6 +296,7 @@ fn a_detector_follows_components_that_come_and_go_behind_two_stations() {
 }
 
 #[test]
+#[expect(clippy::too_many_lines, reason = "one story of two workstations")]
 fn a_composite_uses_a_robot_of_another_workstation_and_is_run_from_the_cell() {
     let Some(cell) = Cell::with(&[]) else {
         return;

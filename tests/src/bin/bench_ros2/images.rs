@@ -100,7 +100,7 @@ impl Paths {
     fn measure(&mut self, kind: &Kind, load: Load, seconds: u64) {
         let pace = load.pace(seconds * u64::from(load.rate));
         let mut reference = None;
-        for path in 0..NAMES.len() {
+        for (path, name) in NAMES.into_iter().enumerate() {
             let dropped = bridges_dropped();
             let mut report = match path {
                 0 => passed(&mut self.fast_dds, pace),
@@ -123,7 +123,7 @@ impl Paths {
                 "| {} | {megabytes} MB | {} Hz | {} | {} | {} | {} | {p50:.1} | {:.1} | {:.2} |",
                 kind.name,
                 load.rate,
-                NAMES[path],
+                name,
                 pace.ticks,
                 pace.ticks - report.distinct.min(pace.ticks),
                 bridges_dropped() - dropped,
