@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use discovery::{Found, Known, Watcher};
 use knowledge::{ComponentFacts, NodeName};
-use skills::{FoundSkill, SkillClient, SkillFault};
+use skills::{FoundSkill, SkillClient, SkillFault, StationChanges};
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::{debug, warn};
 
@@ -115,14 +115,28 @@ async fn once(cell: &Cell, seen: &Seen) -> Result<(), SkillFault> {
         };
         cell.came(&seen, of, found.clone(), listed);
     }
+    show_states(cell, &client, (&uri, &found), changes).await;
+    client.close().await;
+    Ok(())
+}
+
+/// Publishes the states of the skills of a server until its connection is lost, or its components
+/// change.
+async fn show_states(
+    cell: &Cell,
+    client: &SkillClient,
+    (uri, found): (&str, &[FoundSkill]),
+    changes: Option<StationChanges>,
+) {
     let iri = |found: &FoundSkill| {
+        let behind = found.behind.as_deref();
         let facts = ComponentFacts {
-            application_uri: found.behind.clone().unwrap_or_else(|| uri.clone()),
+            application_uri: behind.unwrap_or(uri).to_owned(),
             ..ComponentFacts::default()
         };
         Some(facts.skill_iri(&NodeName::parse(&found.node)?))
     };
-    let states = live::skills(cell.knowledge(), &client, (&uri, &found), iri);
+    let states = live::skills(cell.knowledge(), client, (uri, found), iri);
     match changes {
         Some(mut changes) => tokio::select! {
             () = states => {}
@@ -130,8 +144,6 @@ async fn once(cell: &Cell, seen: &Seen) -> Result<(), SkillFault> {
         },
         None => states.await,
     }
-    client.close().await;
-    Ok(())
 }
 
 /// Returns the skills by the ApplicationUris of their components: the server itself, or the

@@ -84,10 +84,14 @@ impl JobControl {
             match name {
                 "Update" => orders.update(order, runs),
                 "Store" => orders.store(order, runs),
-                _ => match orders.store(order, runs) {
-                    Status::Good => orders.command(id.as_ref(), Command::Start, runs),
-                    other => other,
-                },
+                _ => {
+                    let stored = orders.store(order, runs);
+                    if stored == Status::Good {
+                        orders.command(id.as_ref(), Command::Start, runs)
+                    } else {
+                        stored
+                    }
+                }
             }
         };
         info!(order = id.as_ref(), ?status, "{name} of a job order");
@@ -309,7 +313,7 @@ fn parameter(name: &str, value: &Json) -> Parameter {
         Json::Bool(value) => Variant::from(*value),
         Json::Number(number) => Variant::from(number.as_f64().unwrap_or(f64::NAN)),
         Json::String(text) => Variant::from(text.as_str()),
-        other => Variant::from(other.to_string().as_str()),
+        Json::Null | Json::Array(_) | Json::Object(_) => Variant::from(value.to_string().as_str()),
     };
     Parameter {
         id: name.into(),

@@ -134,11 +134,12 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
     })
 }
 
+/// The position of a step, its IRI and its rows.
+type Positioned<'a> = (i64, &'a str, Vec<&'a Row>);
+
 /// Returns the steps with their rows, in the order of their positions.
-fn in_order<'a>(
-    by_part: BTreeMap<&'a str, Vec<&'a Row>>,
-) -> Result<Vec<(i64, &'a str, Vec<&'a Row>)>, String> {
-    let mut ordered: Vec<(i64, &str, Vec<&Row>)> = Vec::new();
+fn in_order<'a>(by_part: BTreeMap<&'a str, Vec<&'a Row>>) -> Result<Vec<Positioned<'a>>, String> {
+    let mut ordered: Vec<Positioned<'_>> = Vec::new();
     for (part, rows) in by_part {
         let position = one(&rows, "position")?.and_then(Value::as_i64);
         let position =

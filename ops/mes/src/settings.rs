@@ -145,14 +145,10 @@ impl Reading<'_> {
         };
         let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
         let nodesets = nodesets.map_or_else(Vec::new, |node| self.files(node));
-        let manifests = manifests
-            .map(|node| self.each(node, Self::manifest))
-            .unwrap_or_default();
+        let manifests = manifests.map_or_else(Vec::new, |node| self.each(node, Self::manifest));
         let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
         let recipes = recipes.map_or_else(Vec::new, |node| self.each(node, Self::recipe));
-        let processes = processes
-            .map(|node| self.each(node, Self::process))
-            .unwrap_or_default();
+        let processes = processes.map_or_else(Vec::new, |node| self.each(node, Self::process));
         let names = manifests.iter().map(|manifest| &*manifest.source.name);
         self.once(root, names, "manifest");
         self.files_once(root, &knowledge, &rml);

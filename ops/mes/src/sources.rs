@@ -328,9 +328,10 @@ impl SourceFiles for Sources {
         self.of_yaml(&source)?;
         let is_new = !self.is_known(&source);
         self.state().findings.remove(&source);
-        let recipe = match kind {
-            SourceKind::Process => recipe::in_source(contents)?,
-            _ => None,
+        let recipe = if kind == SourceKind::Process {
+            recipe::in_source(contents)?
+        } else {
+            None
         };
         match (kind, read) {
             (SourceKind::Process, _) if recipe.is_some() => {

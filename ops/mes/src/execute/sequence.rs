@@ -155,12 +155,10 @@ impl Execution<'_> {
             self.over((number, offer), end, (chosen, &mut *progress), &mut ended);
         }
         let mut left = 0..self.process.steps.len();
-        match ended {
-            Ended::Done if left.any(|number| !progress.is_over(number)) => {
-                Ended::Over("steps of the process wait for each other".to_owned())
-            }
-            ended => ended,
+        if matches!(ended, Ended::Done) && left.any(|number| !progress.is_over(number)) {
+            return Ended::Over("steps of the process wait for each other".to_owned());
         }
+        ended
     }
 
     /// Returns a step that can begin. Steps whose conditions do not hold are skipped. A component

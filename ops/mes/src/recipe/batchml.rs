@@ -738,7 +738,7 @@ fn constant(texts: &[&str], kind: &str) -> Option<Value> {
             "string" | "text" | "identifier" => Some(Value::String(text.to_owned())),
             "" | "other" => match values::value(text) {
                 Written::Value { value, unit: None } => Some(value),
-                _ => Some(Value::String(text.to_owned())),
+                Written::Value { .. } | Written::Result(..) => Some(Value::String(text.to_owned())),
             },
             _ => {
                 let value: Value = serde_json::from_str(text).ok()?;

@@ -290,7 +290,7 @@ fn an_exclusive_gateway_needs_a_default_flow_and_results_need_their_step() {
         )
     };
     let steps = steps(&of(r#"default="f3""#, "${weigh.Rest}"));
-    assert_eq!(steps[1].when[0][0].is_negated, false);
+    assert!(!steps[1].when[0][0].is_negated);
     assert_eq!(steps[1].parameters[0].result.as_ref().unwrap().step, 0);
     assert!(steps[2].when.is_empty(), "{:?}", steps[2]);
     let both = of("", "1").replace(
