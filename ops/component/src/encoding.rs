@@ -14,9 +14,11 @@ pub(crate) fn encoded(field: &CallField, value: &Json, namespace: u16) -> Result
     if let Some(structure) = &field.structure {
         return structures(field.rank, structure, value, namespace);
     }
-    let none = || match field.builtin {
-        BuiltinType::ExtensionObject => "the executor does not announce its fields".to_owned(),
-        other => format!("a {other:?} cannot be written in a component"),
+    let none = || {
+        if field.builtin == BuiltinType::ExtensionObject {
+            return "the executor does not announce its fields".to_owned();
+        }
+        format!("a {:?} cannot be written in a component", field.builtin)
     };
     let builtin = Builtin::of_id(u32::from(field.builtin as u8)).ok_or_else(none)?;
     let array = field.rank != Rank::Scalar;

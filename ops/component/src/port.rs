@@ -157,19 +157,7 @@ impl ComponentPort {
         let application = application(&told, &component.security);
         enrol(&mut looks, (component, &told), options, &server);
         let announced = announce(told, component, options, settings.supervision);
-        if server.skills().len() > MOST_IN_SPACE {
-            warn!(
-                "more than {MOST_IN_SPACE} skills: the others are only available over OPC UA, not in the space"
-            );
-        }
-        info!(
-            skills = server.skills().len(),
-            values = server.values().len(),
-            namespace = component.namespace,
-            "{} is served at {}",
-            component.name,
-            server.url()
-        );
+        log_served(component, &server);
         let (executes, executed) = mpsc::channel(MOST_EXECUTIONS);
         Ok(Self {
             server,
@@ -582,6 +570,23 @@ fn power_off() -> PowerOff {
             bridge_node::stop();
         }));
     }))
+}
+
+/// Logs where a component is served, and whether it has too many skills for the space.
+fn log_served(component: &Component, server: &ComponentServer) {
+    if server.skills().len() > MOST_IN_SPACE {
+        warn!(
+            "more than {MOST_IN_SPACE} skills: the others are only available over OPC UA, not in the space"
+        );
+    }
+    info!(
+        skills = server.skills().len(),
+        values = server.values().len(),
+        namespace = component.namespace,
+        "{} is served at {}",
+        component.name,
+        server.url()
+    );
 }
 
 /// Renews the certificate of the component at the Global Discovery Server.
