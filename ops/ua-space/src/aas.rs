@@ -135,7 +135,7 @@ mod tests {
                 map.values().for_each(|value| find(value, id_short, found));
             }
             Value::Array(all) => all.iter().for_each(|value| find(value, id_short, found)),
-            _ => {}
+            Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => {}
         }
     }
 

@@ -106,7 +106,11 @@ fn variant(field: &Field, value: &Value) -> Result<Vec<u8>, Unusable> {
     };
     let value = match value {
         Value::Array(all) => all.into_iter().map(|one| typed(builtin, one)).collect(),
-        one => typed(builtin, one),
+        one @ (Value::Null
+        | Value::Bool(_)
+        | Value::Number(_)
+        | Value::String(_)
+        | Value::Object(_)) => typed(builtin, one),
     };
     // A null text differs from no value.
     let is_text = matches!(

@@ -224,7 +224,7 @@ mod tests {
         let all = fields(bytes).into_iter();
         let inner = all.filter_map(|(field, value)| match value {
             Value::Bytes(bytes) if field == u64::from(number) => Some(bytes),
-            _ => None,
+            Value::Number(_) | Value::Bytes(_) => None,
         });
         inner.collect()
     }
