@@ -132,8 +132,8 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
     let mut before = 0;
     // A second replay repeats sequence numbers and values, and is delivered all the same.
     for turn in 1..=2 {
-        // At half the speed, most values follow the discovery of the writer, on a slow host too.
-        let words = ["replay", text(&packets), "--speed", "0.5", "--json"];
+        // At a fifth of the speed, most values follow the discovery of the writer, on a slow host too.
+        let words = ["replay", text(&packets), "--speed", "0.2", "--json"];
         let (code, replayed) = ended(&words);
         assert_eq!(code, 0, "{replayed}");
         let summary = replayed.json_lines().pop().unwrap();
@@ -149,7 +149,7 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
     let got = joints_there.wait_for_json("joints", SOON, |line| line.get("value").cloned());
     assert_eq!(got["position"], json!([0.5, -0.25]), "{got}");
     assert_eq!(commands_there.values(), Vec::<Value>::new());
-    let words = ["replay", text(&packets), "--commands", "--speed", "0.5"];
+    let words = ["replay", text(&packets), "--commands", "--speed", "0.2"];
     let (code, replayed) = ended(&words);
     assert_eq!(code, 0, "{replayed}");
     eventually("the commands of the replay are in ROS 2", SOON, || {
@@ -161,7 +161,7 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
 /// Replays an MCAP file: its values are the same messages in ROS 2, and its commands are left out.
 fn replay_values(values: &Path, joints_there: &Child) {
     let before = joints_there.values().len();
-    let (code, replayed) = ended(&["replay", text(values), "--speed", "0.5", "--json"]);
+    let (code, replayed) = ended(&["replay", text(values), "--speed", "0.2", "--json"]);
     assert_eq!(code, 0, "{replayed}");
     let summary = replayed.json_lines().pop().unwrap();
     let left_out = summary["left_out"].as_object().unwrap();
