@@ -8,19 +8,18 @@ mod report;
 
 use std::fs;
 use std::path::PathBuf;
-use std::process::{ExitStatus, Output, Stdio};
+use std::process::{Output, Stdio};
 use std::time::Duration;
 
 use serde::Deserialize;
-use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, timeout};
 
 use self::report::{Report, StepRun};
 use crate::clock::{millis, wall_nanos};
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who, command,
-    fetch, find, free_port, must_be_free,
+    Failure, Interrupt, LOOPBACK, Program, Programs, Stage, Stop, Timeline, Who, command, fetch,
+    find, free_port, must_be_free, unexpected,
 };
 
 /// The options of the scenario.
@@ -150,40 +149,7 @@ async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
     };
     reports.close();
     let outcome = played.map_err(|stop| story.failure(stop));
-    story.programs.end().await;
-    // The logs are kept after a failure.
-    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
-        && let Err(error) = story.programs.clean_up()
-    {
-        tracing::debug!(%error, "the logs were not removed");
-    }
-    outcome
-}
-
-/// The reason why the scenario stops.
-enum Stop {
-    Failed(Failure),
-    Broken(String),
-    Ended(&'static str, ExitStatus),
-    Interrupted,
-}
-
-impl From<Failure> for Stop {
-    fn from(failure: Failure) -> Self {
-        Self::Failed(failure)
-    }
-}
-
-/// Returns the first program that ends unexpectedly.
-async fn unexpected(reports: &mut mpsc::Receiver<Told>) -> (&'static str, ExitStatus) {
-    loop {
-        match reports.recv().await {
-            Some(Told::Ended { name, status }) => return (name, status),
-            Some(Told::Killed { .. } | Told::Told(_) | Told::Garbled { .. }) => {}
-            // The programs hold a sender, so the channel does not close before them.
-            None => std::future::pending().await,
-        }
-    }
+    story.programs.conclude(outcome).await
 }
 
 struct Binaries {
@@ -392,20 +358,9 @@ impl Story<'_> {
     }
 
     fn failure(&self, stop: Stop) -> Failure {
-        let logs = self.programs.directory().to_owned();
-        match stop {
-            Stop::Failed(failure) => failure,
-            Stop::Broken(why) => Failure::Broken { why, logs },
-            Stop::Ended(name, status) => Failure::ChildEnded {
-                name,
-                status,
-                last_lines: self.programs.last_lines(name),
-                logs,
-            },
-            Stop::Interrupted => Failure::Interrupted {
-                standing: format!("{} steps had begun", self.show.report.steps.len()),
-            },
-        }
+        stop.failure(&self.programs, || {
+            format!("{} steps had begun", self.show.report.steps.len())
+        })
     }
 }
 

@@ -104,14 +104,7 @@ async fn perform(
     let outcome = stage.direct(hops).await;
     // No reports are read after this point, and no process may block on sending them.
     stage.reports.close();
-    stage.programs.end().await;
-    // The logs are kept after a failure.
-    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
-        && let Err(error) = stage.programs.clean_up()
-    {
-        tracing::debug!(%error, "the logs were not removed");
-    }
-    outcome
+    stage.programs.conclude(outcome).await
 }
 
 /// The programs that are started.

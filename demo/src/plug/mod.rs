@@ -180,14 +180,7 @@ async fn perform(plan: &Plan, manifest: &Manifest, show: &mut Show) -> Result<()
     // No reports are read after this point, and no process may block on sending them.
     director.reports.close();
     director.facts.close();
-    director.programs.end().await;
-    // The logs are kept after a failure.
-    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
-        && let Err(error) = director.programs.clean_up()
-    {
-        tracing::debug!(%error, "the logs were not removed");
-    }
-    outcome
+    director.programs.conclude(outcome).await
 }
 
 /// The programs that are started.

@@ -40,8 +40,8 @@ use crate::event::{Event, MasterEvent};
 use crate::line::DOMAIN;
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who,
-    address, fetch, find, free_port, must_be_free, open_when_served, status_of,
+    Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Stop, Timeline,
+    Who, address, fetch, find, free_port, must_be_free, open_when_served, status_of,
 };
 
 /// The options of the scenario.
@@ -232,14 +232,7 @@ async fn perform(plan: Plan, show: &Show) -> Result<(), Failure> {
         report.by_turtlebot = world.by_turtlebot();
         report.taken_back = world.taken_back();
     }
-    story.programs.end().await;
-    // The logs are kept after a failure.
-    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
-        && let Err(error) = story.programs.clean_up()
-    {
-        tracing::debug!(%error, "the logs were not removed");
-    }
-    outcome
+    story.programs.conclude(outcome).await
 }
 
 /// Receives the events of the machines and updates the world.
@@ -309,20 +302,6 @@ fn describe(event: MachineEvent) -> (Who, String) {
         MachineEvent::Belt { runs: false } => (BELT, "stands still".to_owned()),
         MachineEvent::Leaves => (BASE, "sets out".to_owned()),
         MachineEvent::Arrives { at: [x, y] } => (BASE, format!("stands at {x}, {y}")),
-    }
-}
-
-/// The reason why the scenario stops.
-enum Stop {
-    Failed(Failure),
-    Broken(String),
-    Ended(&'static str, ExitStatus),
-    Interrupted,
-}
-
-impl From<Failure> for Stop {
-    fn from(failure: Failure) -> Self {
-        Self::Failed(failure)
     }
 }
 
@@ -604,20 +583,7 @@ impl Story<'_> {
     }
 
     fn failure(&self, stop: Stop) -> Failure {
-        let logs = self.programs.directory().to_owned();
-        match stop {
-            Stop::Failed(failure) => failure,
-            Stop::Broken(why) => Failure::Broken { why, logs },
-            Stop::Ended(name, status) => Failure::ChildEnded {
-                name,
-                status,
-                last_lines: self.programs.last_lines(name),
-                logs,
-            },
-            Stop::Interrupted => Failure::Interrupted {
-                standing: self.world.borrow().standing(),
-            },
-        }
+        stop.failure(&self.programs, || self.world.borrow().standing())
     }
 }
 

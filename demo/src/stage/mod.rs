@@ -7,6 +7,7 @@ mod hops;
 mod interrupt;
 mod pages;
 mod programs;
+mod stop;
 mod timeline;
 
 pub(crate) use beside::{find, free_port, must_be_free};
@@ -16,6 +17,7 @@ pub(crate) use hops::{Hop, Hops, delays, micros};
 pub(crate) use interrupt::Interrupt;
 pub(crate) use pages::fetch;
 pub(crate) use programs::{Program, Programs, Report, Stage, command};
+pub(crate) use stop::{Stop, unexpected};
 pub(crate) use timeline::{Timeline, Who};
 
 /// The interface of the PubSub group, by address, because its name differs between systems.

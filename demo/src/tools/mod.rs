@@ -15,7 +15,6 @@ mod cell;
 mod report;
 
 use std::path::PathBuf;
-use std::process::ExitStatus;
 use std::time::Duration;
 
 use plant_opcua::client::SecurityChoice;
@@ -23,7 +22,6 @@ use serde_json::Value as Json;
 use skills::{
     ClientOptions, Outcome, Runs as _, SkillClient, SkillFault, SkillHandle, TypeName, Value,
 };
-use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, timeout};
 
 use self::cell::{CHANGER, DEVICE_PORTS, FINGERS, HANDLING, PARTS, Part, VACUUM};
@@ -31,8 +29,8 @@ use self::report::{Report, Run};
 use crate::clock::{millis, wall_nanos};
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who, address,
-    fetch, find, free_port, must_be_free, open_when_served,
+    Failure, Interrupt, LOOPBACK, Program, Programs, Stage, Stop, Timeline, Who, address, fetch,
+    find, free_port, must_be_free, open_when_served, unexpected,
 };
 
 /// The options of the scenario.
@@ -129,40 +127,7 @@ async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
     };
     reports.close();
     let outcome = played.map_err(|stop| story.failure(stop));
-    story.programs.end().await;
-    // The logs are kept after a failure.
-    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
-        && let Err(error) = story.programs.clean_up()
-    {
-        tracing::debug!(%error, "the logs were not removed");
-    }
-    outcome
-}
-
-/// The reason why the scenario stops.
-enum Stop {
-    Failed(Failure),
-    Broken(String),
-    Ended(&'static str, ExitStatus),
-    Interrupted,
-}
-
-impl From<Failure> for Stop {
-    fn from(failure: Failure) -> Self {
-        Self::Failed(failure)
-    }
-}
-
-/// Returns the first program that ends unexpectedly.
-async fn unexpected(reports: &mut mpsc::Receiver<Told>) -> (&'static str, ExitStatus) {
-    loop {
-        match reports.recv().await {
-            Some(Told::Ended { name, status }) => return (name, status),
-            Some(Told::Killed { .. } | Told::Told(_) | Told::Garbled { .. }) => {}
-            // The programs hold a sender, so the channel does not close before them.
-            None => std::future::pending().await,
-        }
-    }
+    story.programs.conclude(outcome).await
 }
 
 struct Story<'a> {
@@ -484,20 +449,9 @@ impl Story<'_> {
     }
 
     fn failure(&self, stop: Stop) -> Failure {
-        let logs = self.programs.directory().to_owned();
-        match stop {
-            Stop::Failed(failure) => failure,
-            Stop::Broken(why) => Failure::Broken { why, logs },
-            Stop::Ended(name, status) => Failure::ChildEnded {
-                name,
-                status,
-                last_lines: self.programs.last_lines(name),
-                logs,
-            },
-            Stop::Interrupted => Failure::Interrupted {
-                standing: format!("{} runs were over", self.show.report.runs.len()),
-            },
-        }
+        stop.failure(&self.programs, || {
+            format!("{} runs were over", self.show.report.runs.len())
+        })
     }
 }
 
