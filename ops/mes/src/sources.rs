@@ -183,13 +183,14 @@ impl Sources {
             true => info!(source = source.name, "{what}"),
             false => warn!(source = source.name, "{what}"),
         }
-        let found = finding(source, what, false);
+        self.keep(source, finding(source, what, false));
+    }
+
+    /// Adds a finding to those of its source.
+    fn keep(&self, source: &Source, found: Finding) {
         let mut state = self.state();
-        state
-            .findings
-            .entry(source.clone())
-            .or_default()
-            .push(found);
+        let findings = state.findings.entry(source.clone()).or_default();
+        findings.push(found);
     }
 
     /// Runs an RML mapping.
@@ -254,13 +255,7 @@ impl Sources {
                 let first = errors.next().map(|found| found.to_string());
                 for found in errors {
                     warn!(source = source.name, "{found}");
-                    let found = finding(source, found.to_string(), true);
-                    let mut state = self.state();
-                    state
-                        .findings
-                        .entry(source.clone())
-                        .or_default()
-                        .push(found);
+                    self.keep(source, finding(source, found.to_string(), true));
                 }
                 return Err(first.unwrap_or_default());
             }
