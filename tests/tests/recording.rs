@@ -132,7 +132,7 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
     let mut before = 0;
     // A second replay repeats sequence numbers and values, and is delivered all the same.
     for turn in 1..=2 {
-        // At a fifth of the speed, most values follow the discovery of the writer, on a slow host too.
+        // At a fifth of the speed most values follow the discovery, on slow hosts too.
         let words = ["replay", text(&packets), "--speed", "0.2", "--json"];
         let (code, replayed) = ended(&words);
         assert_eq!(code, 0, "{replayed}");
