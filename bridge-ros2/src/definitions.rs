@@ -5,12 +5,12 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use crate::type_description::TypeSource;
 use bridge_node::{Environment, TypePaths};
 use messages::{
     ActionCalls, ActionMessages, ActionTypeHashes, DefinitionError, DescribedType, Dialect,
     MessageType, Registry, ServiceType, ServiceTypeHashes, TextKind, TypeHash, TypeName,
 };
+use ros2_node::type_description::TypeSource;
 use uadp::BuiltinType;
 
 /// Finds message types by name and caches them.

@@ -7,7 +7,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
 use bridge_core::Local;
 use bridge_node::{
@@ -18,14 +18,16 @@ use clap::Parser;
 use mappings::{Mapping, SpaceId};
 use mdns::{Bridge, TellingArguments, tell_bridge};
 use plant_keys::KeyArguments;
+use ros2_node::discovery_info::GidLength;
+use ros2_node::domain::{DiscoveryRange, DomainError, DomainOptions};
+use ros2_node::limits;
+use ros2_node::node::NodeOptions;
+use ros2_node::security::Security;
 use tracing::{info, warn};
 use transport::{Interface, InterfaceError};
 
-use crate::discovery_info::GidLength;
-use crate::domain::{DiscoveryRange, DomainError, DomainOptions};
-use crate::node::NodeOptions;
-use crate::security::Security;
-use crate::{PortOptions, Ros2Port, RosArgs, environment, limits};
+use crate::ros_args::RosArgs;
+use crate::{PortOptions, Ros2Port, environment};
 
 /// Runs `bridge-ros2` from its command line to its end. `arguments` begin with the name of the
 /// program.
@@ -45,7 +47,7 @@ pub fn shared(arguments: Vec<OsString>) -> Result<SharedProgram, ExitCode> {
 
 /// Carries topics between a ROS 2 domain and the space of OPC UA PubSub.
 #[derive(Debug, Parser)]
-#[command(name = "bridge-ros2", version = limits::version())]
+#[command(name = "bridge-ros2", version = version())]
 struct BridgeRos2 {
     #[command(flatten)]
     arguments: Arguments,
@@ -168,6 +170,19 @@ impl BridgeRos2 {
         .map(DiscoveryRange::networks)
         .map_err(|error| Failure::new(FailureKind::Usage, error.to_string()))
     }
+}
+
+/// Returns the version of this program and of its RustDDS.
+fn version() -> &'static str {
+    static VERSION: LazyLock<String> = LazyLock::new(|| {
+        format!(
+            "{} ({}, {})",
+            build_info::version(),
+            limits::RUSTDDS,
+            limits::SECURITY
+        )
+    });
+    &VERSION
 }
 
 /// Returns the given numbers; an empty environment variable gives no number, as in rcl.

@@ -3,7 +3,7 @@
 
 /// Returns a warning for each variable that is set and has no effect on the bridge. `variable`
 /// looks a variable up.
-pub fn ignored(variable: impl Fn(&str) -> Option<String>) -> Vec<String> {
+pub(crate) fn ignored(variable: impl Fn(&str) -> Option<String>) -> Vec<String> {
     let set = |name: &str| {
         let value = variable(name)?;
         let value = value.trim();

@@ -16,7 +16,6 @@ mod reconcile;
 mod reload;
 mod schedule;
 mod services;
-mod strangers;
 mod strays;
 mod writing;
 
@@ -32,38 +31,40 @@ use bridge_node::policy::{Policy, Read, Step, TYPE_CHANGES, Word, is_bad, type_c
 use bridge_node::{
     Actions, Answered, AskId, AwaitedPeers, CallDescription, Calls, Delivery, Described, Executed,
     Executing, Execution, ExecutionId, Handover, Kept, Port, PortEvent, Reason, Services,
-    TypePaths, now,
+    TypePaths, hear_log, now,
 };
 use bytes::Bytes;
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{ActionCalls, DefinitionError, Selection, TextKind, TypeName};
+use ros2_node::clock::RosClock;
+use ros2_node::domain::{Domain, DomainError, DomainOptions};
+use ros2_node::graph::{Graph, dds_topic};
+use ros2_node::inbox::{Inbox, Taken};
+use ros2_node::limits;
+use ros2_node::outlet::{Former, Progress, Refusal};
+use ros2_node::parameters::ParameterServer;
+use ros2_node::raw::{Payload, RawWriter, Reader};
+use ros2_node::security::rejections::{Rejection, Rejections};
+use ros2_node::service::{ServicePeers, ServiceServer};
+use ros2_node::type_description::TypeServer;
 use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID, StatusEvented};
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 use uadp::BuiltinType;
 
-use crate::clock::RosClock;
 use crate::definitions::Definitions;
 use crate::descriptors::Descriptors;
-use crate::domain::{Domain, DomainError, DomainOptions};
-use crate::graph::{Graph, dds_topic};
-use crate::inbox::{Inbox, Taken};
-use crate::limits;
-use crate::outlet::{Former, Refusal};
-use crate::parameters::ParameterServer;
-use crate::raw::{Payload, RawWriter, Reader};
-use crate::service::{ServicePeers, ServiceServer};
+use crate::entry::NAME;
 use crate::sink::Sink;
 use crate::source::{Source, same_participant};
-use crate::type_description::TypeServer;
 
 use descriptions::Descriptions;
 use drops::Drops;
 use reconcile::MAX_BATCH;
 use schedule::Schedule;
 use services::{Client, Ros2Graph};
-use strangers::{KEPT_OUT, Stranger, Strangers};
+use writing::{cause, handover};
 
 /// The options with which a [`Ros2Port`] starts.
 #[derive(Debug, Clone)]
@@ -88,7 +89,7 @@ pub struct Ros2Port {
     /// Announces this bridge to the other bridges of the domain.
     presence: RawWriter,
     discovery: DomainParticipantStatusListener,
-    strangers: Strangers,
+    rejections: Rejections,
     policy: Policy,
     domain_id: u16,
     /// The addresses to which RustDDS binds its sockets; empty means all addresses.
@@ -165,6 +166,9 @@ impl Ros2Port {
             dds = limits::RUSTDDS,
             "joined the DDS domain"
         );
+        if let Some(log) = domain.rosout() {
+            hear_log(NAME, &log);
+        }
         let presence = domain.announce_bridge(own.into())?;
         let mut definitions = Definitions::new(types, prefixes);
         let peers = ServicePeers::new(&domain);
@@ -182,7 +186,7 @@ impl Ros2Port {
         let mut port = Self {
             discovery: domain.status_listener(),
             joined: Instant::now(),
-            strangers: Strangers::default(),
+            rejections: Rejections::default(),
             domain,
             presence,
             policy: Policy::new(own, mapping),
@@ -318,16 +322,16 @@ impl Ros2Port {
         let mut events = self.discovery.as_async_status_stream();
         while let Poll::Ready(Some(event)) = events.poll_next_unpin(cx) {
             self.schedule.changed |= is_change(&event);
-            kept_out.extend(self.strangers.note(&event, now));
+            kept_out.extend(self.rejections.note(&event, now));
         }
-        self.tell_strangers(&kept_out);
+        self.report_rejections(&kept_out);
         self.schedule.changed && !before || !kept_out.is_empty()
     }
 
-    fn tell_strangers(&mut self, strangers: &[Stranger]) {
-        for stranger in strangers {
-            if self.strangers.is_new(stranger) {
-                warn!("DDS Security: {stranger}");
+    fn report_rejections(&mut self, rejections: &[Rejection]) {
+        for rejection in rejections {
+            if self.rejections.is_new(rejection) {
+                warn!("DDS Security: {rejection}");
             }
             self.events.push_back(PortEvent::Lost {
                 topic: None,
@@ -405,8 +409,8 @@ impl Ros2Port {
         if self.schedule.is_waiting() {
             self.flush(now);
         }
-        let overdue = self.strangers.overdue(now);
-        self.tell_strangers(&overdue);
+        let overdue = self.rejections.overdue(now);
+        self.report_rejections(&overdue);
         if now >= self.schedule.next_reconcile() {
             self.reconcile(now);
         }
@@ -425,7 +429,7 @@ impl Ros2Port {
                 continue;
             };
             if let Err(refusal) = open.outlet.flush(now) {
-                self.events.push_back(lost(topic, refusal.cause(), 1));
+                self.events.push_back(lost(topic, cause(refusal), 1));
             }
             self.schedule.note_waiting(topic, open.outlet.is_waiting());
         }
@@ -538,7 +542,7 @@ impl Port for Ros2Port {
         let offered = match offered {
             // An older sample was lost: the new sample must not be offered again.
             Err(Refusal::Overflow) if confirmed.is_some() => {
-                let cause = Refusal::Overflow.cause();
+                let cause = cause(Refusal::Overflow);
                 self.events.push_back(lost(topic, cause, 1));
                 Ok(())
             }
@@ -554,12 +558,15 @@ impl Port for Ros2Port {
                 )
             });
         }
-        offered.map_err(Refusal::label)
+        offered.map_err(|refusal| cause(refusal).1)
     }
 
     fn handover(&self, topic: TopicId) -> Handover {
         let sink = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
-        let outlet = || sink.map_or(Handover::Nobody, |open| open.outlet.handover());
+        let outlet = || {
+            let progress = sink.map_or(Progress::NoReader, |open| open.outlet.progress());
+            handover(progress)
+        };
         self.services.handover(topic).unwrap_or_else(outlet)
     }
 
@@ -763,6 +770,9 @@ fn lost(topic: TopicId, (reason, why): (Reason, &'static str), count: u64) -> Po
 const BY_BRIDGE: (Reason, &str) = (Reason::Looped, "published by another bridge");
 /// The reason for samples that RustDDS reports as lost.
 const UNREAD: (Reason, &str) = (Reason::Overflow, "lost before they were read");
+
+/// The reason under which rejected participants are counted.
+const KEPT_OUT: &str = "participant not authenticated";
 
 /// Returns whether a discovery event may change the set of endpoints.
 fn is_change(event: &DomainParticipantStatusEvent) -> bool {

@@ -4,15 +4,15 @@
 
 /// The settings of a node in ROS arguments.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct RosArgs {
+pub(crate) struct RosArgs {
     /// `-r __node:=NAME`.
-    pub name: Option<String>,
+    pub(crate) name: Option<String>,
     /// `-r __ns:=/NAMESPACE`.
-    pub namespace: Option<String>,
+    pub(crate) namespace: Option<String>,
     /// `--enclave /NAME`.
-    pub enclave: Option<String>,
+    pub(crate) enclave: Option<String>,
     /// `-p use_sim_time:=true`.
-    pub use_sim_time: Option<bool>,
+    pub(crate) use_sim_time: Option<bool>,
 }
 
 impl RosArgs {
@@ -21,7 +21,7 @@ impl RosArgs {
     /// # Errors
     /// An argument that a bridge does not support, such as another name for a topic: it would be
     /// ignored silently otherwise.
-    pub fn parse<S: AsRef<str>>(words: &[S]) -> Result<Self, String> {
+    pub(crate) fn parse<S: AsRef<str>>(words: &[S]) -> Result<Self, String> {
         let mut found = Self::default();
         let mut words = words.iter().map(AsRef::as_ref);
         while let Some(word) = words.next() {

@@ -7,14 +7,14 @@ use bridge_node::policy::{Choice, Destination};
 use bytes::{Bytes, BytesMut};
 use mappings::{Lasting, Overflow};
 use messages::TypeName;
+use ros2_node::clock::RosTime;
+use ros2_node::compatibility::finite_deadline;
+use ros2_node::graph::{Endpoint, dds_topic};
+use ros2_node::outlet::Outlet;
+use ros2_node::qos::Offered;
 use rustdds::Duration;
 
-use crate::clock::RosTime;
-use crate::compatibility::finite_deadline;
 use crate::definitions::Definition;
-use crate::graph::{Endpoint, dds_topic};
-use crate::outlet::Outlet;
-use crate::qos::Offered;
 
 /// The destination of the values of a topic of another space.
 #[derive(Debug)]
@@ -138,7 +138,7 @@ fn offered(overflow: Overflow, lasting: Lasting) -> Offered {
     let is_offered = match lasting {
         Lasting::State => true,
         Lasting::Event => false,
-        Lasting::AsSource => crate::limits::PATCHED,
+        Lasting::AsSource => ros2_node::limits::PATCHED,
     };
     match overflow {
         Overflow::KeepLatest if is_offered => Offered::KeepLatest,

@@ -6,12 +6,12 @@ use bridge_node::PublisherKey;
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::{Selection, TypeHash, TypeName};
+use ros2_node::graph::Endpoint;
+use ros2_node::inbox::SlotId;
+use ros2_node::qos::Requested;
 use rustdds::{GUID, RTPSEntity};
 
 use crate::definitions::Definition;
-use crate::graph::Endpoint;
-use crate::inbox::SlotId;
-use crate::qos::Requested;
 
 /// A topic that other nodes write, and the values of our space that it holds.
 #[derive(Debug)]

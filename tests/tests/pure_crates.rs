@@ -91,6 +91,22 @@ fn tcpros_is_a_ros_1_library_that_knows_no_space() {
 }
 
 #[test]
+fn ros2_node_is_a_ros_2_library_that_knows_no_space() {
+    does_not_reach(
+        "ros2-node",
+        &[
+            "mappings",
+            "bridge-*",
+            "transport",
+            "tcpros",
+            "type-files",
+            "ros2-client",
+            "async-opcua",
+        ],
+    );
+}
+
+#[test]
 fn transport_does_not_know_what_a_datagram_means() {
     does_not_reach(
         "transport",
@@ -143,7 +159,13 @@ fn the_shell_knows_no_ros_library() {
 fn each_bridge_knows_its_own_ros_library_only() {
     does_not_reach(
         "bridge-ros1",
-        &["ros2-client", "rustdds", "bridge-ros2", "rosrust*"],
+        &[
+            "ros2-client",
+            "ros2-node",
+            "rustdds",
+            "bridge-ros2",
+            "rosrust*",
+        ],
     );
     does_not_reach(
         "bridge-ros2",
@@ -361,11 +383,7 @@ const NAMES_OF_UA_BRIDGE: [(&str, &[&str]); 6] = [
 fn only_ua_bridge_depends_on_the_programs_that_it_acts_as() {
     let all = NAMES_OF_UA_BRIDGE.map(|(name, _)| name);
     for (package, _) in NAMES_OF_UA_BRIDGE {
-        does_not_reach(package, &["bridge-ros1"]);
-        // `ua-space init` reads the graph of DDS with the library of the bridge.
-        if package != "ua-space" {
-            does_not_reach(package, &["bridge-ros2"]);
-        }
+        does_not_reach(package, &["bridge-ros1", "bridge-ros2"]);
     }
     for package in ["bridge-ros1", "bridge-ros2", "demo"] {
         does_not_reach(package, &all);

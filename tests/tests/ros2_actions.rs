@@ -10,11 +10,11 @@ mod served;
 
 use std::time::Duration;
 
-use bridge_ros2::action::{
+use nix::sys::signal::Signal;
+use ros2_node::action::{
     Action, ActionClient, ActionClientOptions, CancelCode, CancelWhat, GoalEvent, GoalHandle,
     GoalId, IdInUse, LostReason, Outcome, Status,
 };
-use nix::sys::signal::Signal;
 use system_tests::{Cell, Child, Peer};
 use tokio::time::timeout;
 
@@ -167,7 +167,7 @@ async fn a_server_of_cyclone_is_asked_to_cancel_one_some_and_all() {
     );
     let some = client.cancel(CancelWhat::Until(stamps[1])).await.unwrap();
     assert_eq!(some.code, CancelCode::None);
-    let ids = |answer: &bridge_ros2::action::CancelAnswer| -> Vec<_> {
+    let ids = |answer: &ros2_node::action::CancelAnswer| -> Vec<_> {
         answer.goals.iter().map(|info| info.id).collect()
     };
     assert_eq!(ids(&some), [goals[0].id()]);

@@ -93,7 +93,7 @@ fn changed_datagrams_of_all_kinds_neither_stop_nor_swell_the_bridge() {
     }
     let step = (datagrams / 10).max(1);
     let mut recent = Vec::new();
-    let all = bridge_ros2::limits::PATCHED || env::var_os("UA_FUZZ_ALL").is_some();
+    let all = ros2_node::limits::PATCHED || env::var_os("UA_FUZZ_ALL").is_some();
     let mut left_out = 0;
     for number in 0..datagrams {
         let datagram = mutator.datagram();

@@ -4,11 +4,11 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use bridge_ros2::clock::RosTime;
-use bridge_ros2::discovery_info::{GidLength, NodeEntities};
-use bridge_ros2::domain::{Domain, DomainOptions, can_announce_type_hashes};
-use bridge_ros2::node::NodeOptions;
-use bridge_ros2::qos::{Offered, Requested};
+use ros2_node::clock::RosTime;
+use ros2_node::discovery_info::{GidLength, NodeEntities};
+use ros2_node::domain::{Domain, DomainOptions, can_announce_type_hashes};
+use ros2_node::node::NodeOptions;
+use ros2_node::qos::{Offered, Requested};
 use serde_json::Value;
 use system_tests::{Cell, Child, METRICS_ROS2, Peer, UaSide, eventually, metrics};
 use uadp::Scalar;

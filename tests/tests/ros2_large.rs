@@ -5,13 +5,13 @@ use std::io::Write as _;
 use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
 
-use bridge_ros2::domain::{Domain, DomainOptions};
-use bridge_ros2::graph::Graph;
-use bridge_ros2::inbox::{Inbox, Taken};
-use bridge_ros2::limits;
-use bridge_ros2::outlet::{Outlet, Refusal};
-use bridge_ros2::qos::{Offered, Requested};
-use bridge_ros2::raw::Payload;
+use ros2_node::domain::{Domain, DomainOptions};
+use ros2_node::graph::Graph;
+use ros2_node::inbox::{Inbox, Taken};
+use ros2_node::limits;
+use ros2_node::outlet::{Outlet, Refusal};
+use ros2_node::qos::{Offered, Requested};
+use ros2_node::raw::Payload;
 use system_tests::{
     BareNode, Cell, Child, HERE, Host, METRICS_ROS1, METRICS_ROS2, Peer, Shape, THERE, UaSide,
     WIRE, Wire, eventually, metrics, numbered, resident,

@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
-use bridge_ros2::domain::{Domain, DomainOptions};
-use bridge_ros2::parameters::{Parameter, ParameterServer, ParameterValue};
-use bridge_ros2::service::ServicePeers;
+use ros2_node::domain::{Domain, DomainOptions};
+use ros2_node::parameters::{Parameter, ParameterServer, ParameterValue};
+use ros2_node::service::ServicePeers;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, METRICS_ROS2, Peer, eventually, metrics, number};
 

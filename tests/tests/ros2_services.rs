@@ -6,13 +6,13 @@ mod secured;
 
 use std::time::Duration;
 
-use bridge_ros2::service::{
-    CallPhase, Service, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions,
-    ServiceServer,
-};
 use bytes::Bytes;
 use futures_util::future::join_all;
 use nix::sys::signal::Signal;
+use ros2_node::service::{
+    CallPhase, Service, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions,
+    ServiceServer,
+};
 use serde_json::json;
 use system_tests::{Cell, Peer};
 

@@ -33,7 +33,13 @@ pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<
 /// Measures relays of DDS samples with a UDP echo, and both bridges between ROS 1 and ROS 2, all in
 /// one run.
 pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
-    let packages = ["bridge-ros1", "bridge-ros2", links::TARGET, "system-tests"];
+    let packages = [
+        "bridge-ros1",
+        "bridge-ros2",
+        "ros2-node",
+        links::TARGET,
+        "system-tests",
+    ];
     measured(workspace, "bench-ros2", &packages, arguments)
 }
 

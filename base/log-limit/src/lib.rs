@@ -5,8 +5,12 @@
 //! the suppressed messages, and return the count with the next logged message. Time is a parameter;
 //! there is no clock.
 
+mod record;
+
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
+
+pub use record::{LogRecord, LogSink};
 
 /// Admits one message per period, or a few, and counts the others.
 #[derive(Debug)]

@@ -11,15 +11,15 @@ use bridge_node::actions::{
 use bridge_node::{CallFault, Ran};
 use bytes::Bytes;
 use messages::{ActionCalls, MessageType, NoFields, Plan, Selection, TextKind, TypeName, Wire};
+use ros2_node::action::{
+    self, Action, ActionClientOptions, ActionServerOptions, GoalError, GoalHandle, LostReason,
+    Outcome, Status,
+};
+use ros2_node::clock::RosTime;
 use tracing::debug;
 use uadp::Timestamp;
 
 use super::services::Ros2Graph;
-use crate::action::{
-    self, Action, ActionClientOptions, ActionServerOptions, GoalError, GoalHandle, LostReason,
-    Outcome, Status,
-};
-use crate::clock::RosTime;
 
 impl ActionGraph for Ros2Graph<'_> {
     type Sender = Client;

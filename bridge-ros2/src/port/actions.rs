@@ -6,13 +6,13 @@ use std::sync::Arc;
 use bridge_node::policy::Policy;
 use bridge_node::{Actions, CallRole, PortEvent};
 use messages::TypeName;
+use ros2_node::graph::Graph;
+use ros2_node::service::{Snapshot, action_type};
 use tokio::time::Instant;
 
 use super::Ros2Port;
 use super::calls::{Kind, Left, SETTLED};
 use super::services::Ros2Graph;
-use crate::graph::Graph;
-use crate::service::{Snapshot, action_type};
 
 impl Ros2Port {
     /// Serves the known actions, as [`offer_calls`](Self::offer_calls) does for services.

@@ -4,11 +4,11 @@ use std::collections::BTreeSet;
 
 use bridge_node::{Actions, AwaitedPeers, Executing, near};
 use mappings::ServiceRole;
+use ros2_node::graph::{Endpoint, ros_topic};
 use tokio::time::Instant;
 
 use super::Ros2Port;
 use super::services::Client;
-use crate::graph::{Endpoint, ros_topic};
 use crate::sink::Sink;
 use crate::source::Source;
 

@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use mappings::{Mapping, SpaceId, TopicId};
+use ros2_node::graph::{Graph, bridge_topic};
+use ros2_node::node::ParticipantPrefix;
 use rustdds::GUID;
 
 use super::Ros2Port;
-use crate::graph::{Graph, bridge_topic};
-use crate::node::ParticipantPrefix;
 
 impl Ros2Port {
     /// Returns whether another bridge serves the space in this domain. Any participant can announce
@@ -113,7 +113,7 @@ fn hex(participant: &ParticipantPrefix) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::graph::{BRIDGE_TYPE, Endpoint};
+    use ros2_node::graph::{BRIDGE_TYPE, Endpoint};
 
     fn guid(first: u8) -> GUID {
         GUID::from_bytes([first; 16])

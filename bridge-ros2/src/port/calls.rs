@@ -9,14 +9,14 @@ use bridge_node::policy::Policy;
 use bridge_node::{Actions, Executing, PortEvent, Present};
 use mappings::{Mapping, TopicId};
 use messages::TypeName;
+use ros2_node::graph::{Endpoint, Graph};
+use ros2_node::service::{Snapshot, service_type};
 use rustdds::RTPSEntity;
 use tokio::time::Instant;
 
 use super::Ros2Port;
 use super::bridges::{Bridge, is_at_home};
 use super::services::{Client, Ros2Graph};
-use crate::graph::{Endpoint, Graph};
-use crate::service::{Snapshot, service_type};
 
 impl Ros2Port {
     /// Offers the known calls as services, within the budget of endpoints.

@@ -5,6 +5,9 @@ use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
 use messages::{DescribedType, TypeHash, TypeName};
+use ros2_node::graph::Endpoint;
+use ros2_node::service::{ServiceClient, ServiceClientOptions, ServicePeers};
+use ros2_node::type_description;
 use rustdds::GUID;
 use tokio::task::{Id, JoinSet};
 use tokio::time::Instant;
@@ -12,9 +15,6 @@ use tracing::{debug, info, warn};
 
 use super::Ros2Port;
 use super::inquiry::{Inquiry, Outcome};
-use crate::graph::Endpoint;
-use crate::service::{ServiceClient, ServiceClientOptions, ServicePeers};
-use crate::type_description;
 
 /// The requested type descriptions and the state of each inquiry.
 pub(super) struct Descriptions {

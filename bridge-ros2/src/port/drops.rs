@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 
 use bridge_core::Reason;
 use bridge_node::PortEvent;
+use ros2_node::service::{ServiceCounters, ServiceServer};
 
 use super::Ros2Port;
-use crate::service::{ServiceCounters, ServiceServer};
 
 /// The reported counts, by reason and cause.
 #[derive(Debug, Default)]

@@ -7,18 +7,18 @@ use bridge_node::policy::{Found, MAX_TOPICS};
 use bridge_node::{PortEvent, Reason};
 use mappings::TopicId;
 use messages::{Selection, TypeName};
+use ros2_node::compatibility::Incompatibility;
+use ros2_node::domain::{Domain, DomainError};
+use ros2_node::graph::{Endpoint, ros_topic};
+use ros2_node::inbox::SlotId;
+use ros2_node::qos::Requested;
 use rustdds::GUID;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
 use super::calls::SETTLED;
 use super::{Ros2Port, lost};
-use crate::compatibility::Incompatibility;
 use crate::definitions::Definition;
-use crate::domain::{Domain, DomainError};
-use crate::graph::{Endpoint, ros_topic};
-use crate::inbox::SlotId;
-use crate::qos::Requested;
 use crate::sink::Sink;
 use crate::source::{OTHER_DEFINITION, OTHER_TYPE, Reading};
 

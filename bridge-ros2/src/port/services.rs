@@ -8,15 +8,15 @@ use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, 
 use bytes::Bytes;
 use mappings::SpaceId;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
-use uadp::BuiltinType;
-
-use crate::definitions::Definitions;
-use crate::domain::Domain;
-use crate::parameters::{Parameter, ParameterValue};
-use crate::service::{
+use ros2_node::domain::Domain;
+use ros2_node::parameters::{Parameter, ParameterValue};
+use ros2_node::service::{
     Recall, Service, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions,
     ServicePeers, ServiceRequest, ServiceServer,
 };
+use uadp::BuiltinType;
+
+use crate::definitions::Definitions;
 
 /// A DDS domain and the known type definitions.
 pub(super) struct Ros2Graph<'p> {

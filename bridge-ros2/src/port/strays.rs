@@ -7,10 +7,10 @@ use std::time::Instant;
 use bridge_node::policy::{Admission, Policy, longest_silent};
 use bridge_node::{PortEvent, Reason, now};
 use mappings::TopicId;
+use ros2_node::graph::Graph;
 
 use super::Ros2Port;
 use super::writing::unwritten;
-use crate::graph::Graph;
 use crate::sink::Sink;
 
 impl Ros2Port {

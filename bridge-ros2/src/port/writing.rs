@@ -2,17 +2,18 @@
 
 use std::sync::Arc;
 
-use bridge_node::{PortEvent, Reason};
+use bridge_node::policy::NO_SUBSCRIBER;
+use bridge_node::{Handover, PortEvent, Reason};
 use mappings::TopicId;
 use messages::Selection;
+use ros2_node::compatibility::Incompatibility;
+use ros2_node::graph::Endpoint;
+use ros2_node::outlet::{Outlet, Progress, Refusal};
 use tokio::time::Instant;
 use tracing::{info, warn};
 
 use super::reconcile::Side;
 use super::{Ros2Port, lost};
-use crate::compatibility::Incompatibility;
-use crate::graph::Endpoint;
-use crate::outlet::Outlet;
 use crate::sink::{Open, shortest_deadline};
 
 impl Ros2Port {
@@ -41,7 +42,7 @@ impl Ros2Port {
         if let Some(open) = &mut sink.open {
             match open.outlet.set_readers(readers, now) {
                 Ok(()) => {}
-                Err(refusal) => self.events.push_back(lost(topic, refusal.cause(), 1)),
+                Err(refusal) => self.events.push_back(lost(topic, cause(refusal), 1)),
             }
             self.schedule.note_waiting(topic, open.outlet.is_waiting());
             if open.outlet.is_repairing() {
@@ -230,7 +231,7 @@ impl Ros2Port {
         info!(topic = dds_topic, message_type = %definition.name(), definition = %definition.from, %offered, "advertised");
         let mut outlet = Outlet::new(writer, offered, self.domain.joined());
         if let Err(refusal) = outlet.set_readers(&readers, Instant::now()) {
-            self.events.push_back(lost(topic, refusal.cause(), 1));
+            self.events.push_back(lost(topic, cause(refusal), 1));
         }
         let message_type = Arc::clone(&definition.message_type);
         let mut selection = Selection::Whole;
@@ -253,6 +254,26 @@ impl Ros2Port {
             message_type,
             selection,
         });
+    }
+}
+
+/// Returns the counter and the label under which a refusal is counted.
+pub(super) fn cause(refusal: Refusal) -> (Reason, &'static str) {
+    match refusal {
+        Refusal::Overflow => (Reason::Overflow, refusal.label()),
+        Refusal::NoReader => (Reason::NoSubscriber, NO_SUBSCRIBER),
+        Refusal::TooLarge(_) | Refusal::Late | Refusal::Failed => {
+            (Reason::NotPublished, refusal.label())
+        }
+    }
+}
+
+/// Returns the handover of a value by the progress of its writer.
+pub(super) const fn handover(progress: Progress) -> Handover {
+    match progress {
+        Progress::NoReader => Handover::Nobody,
+        Progress::Waiting => Handover::Waiting,
+        Progress::Written => Handover::Done,
     }
 }
 

@@ -1,8 +1,7 @@
-//! Relays one topic of a DDS domain to another with the reader and writer of the bridge. The
-//! benchmarks compare it with relays of Cyclone DDS and Fast DDS.
+//! Relays one topic of a DDS domain to another. The benchmarks compare it with relays of Cyclone DDS
+//! and Fast DDS.
 //!
 //! `ros2_relay FROM TO [DOMAIN]`: topics of `std_msgs/msg/String`, on loopback, until SIGTERM.
-//! `UA_BUSY_POLL` has the same meaning as for a bridge.
 
 #![expect(
     clippy::print_stdout,
@@ -14,12 +13,11 @@ use std::num::NonZeroU16;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use bridge_node::{BusyPoll, now};
-use bridge_ros2::domain::{Domain, DomainOptions};
-use bridge_ros2::graph::Endpoint;
-use bridge_ros2::inbox::{Inbox, Taken};
-use bridge_ros2::outlet::Outlet;
-use bridge_ros2::qos::{Offered, Requested};
+use ros2_node::domain::{Domain, DomainOptions};
+use ros2_node::graph::Endpoint;
+use ros2_node::inbox::{Inbox, Taken};
+use ros2_node::outlet::Outlet;
+use ros2_node::qos::{Offered, Requested};
 use tokio::time::Instant;
 
 #[tokio::main(flavor = "current_thread")]
@@ -34,7 +32,7 @@ async fn main() -> ExitCode {
         }
     };
     let result = match domain {
-        // A separate task, as in the bridge: waking the main task costs a system call each time.
+        // A separate task: waking the main task costs a system call each time.
         Ok(domain) => tokio::spawn(relay(from.clone(), to.clone(), domain))
             .await
             .unwrap_or_else(|panic| Err(panic.into())),
@@ -50,12 +48,6 @@ async fn main() -> ExitCode {
 }
 
 async fn relay(from: String, to: String, domain: u16) -> Result<(), Failure> {
-    let window = match std::env::var("UA_BUSY_POLL") {
-        Ok(micros) => micros
-            .parse()
-            .map_err(|e| format!("UA_BUSY_POLL={micros}: {e}"))?,
-        Err(_) => 0,
-    };
     let domain = Domain::join(&DomainOptions {
         domain,
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
@@ -72,22 +64,18 @@ async fn relay(from: String, to: String, domain: u16) -> Result<(), Failure> {
         domain.reader(&from, TYPE, Requested::from_writers(&[]))?,
     );
     println!("{{\"ready\":\"{to}\"}}");
-    let mut busy = BusyPoll::new(Duration::from_micros(window));
     let mut look = tokio::time::interval(LOOK);
     loop {
         tokio::select! {
             biased;
             taken = inbox.recv() => match taken {
                 Taken::Sample { payload, .. } => {
-                    busy.arrived(now().monotonic);
                     if let Err(refusal) = outlet.offer(payload, None, Instant::now()) {
                         eprintln!("relay: {}", refusal.label());
                     }
                 }
                 Taken::Unreadable { why, .. } => eprintln!("relay: {why}"),
             },
-            // As the run loop of a bridge does.
-            () = tokio::task::yield_now(), if busy.looks(|| now().monotonic) => {}
             // More often only while samples wait for room.
             () = tokio::time::sleep(FLUSH), if outlet.is_waiting() => outlet.flush(Instant::now()).map_err(|r| r.label())?,
             _ = look.tick() => {

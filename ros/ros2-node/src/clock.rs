@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 /// The clock of a node: the wall clock, or with `use_sim_time` the time of `/clock`, which is zero
 /// until the first message (design.ros2.org, "Clock and Time").
@@ -39,7 +40,7 @@ impl RosClock {
     #[must_use]
     pub fn now(&self) -> RosTime {
         if !self.is_simulated() {
-            return RosTime::from_unix_nanos(bridge_node::now().utc.unix_nanos());
+            return RosTime::from_unix_nanos(unix_nanos());
         }
         let [a, b, c, d, e, f, g, h] = self.0.time.load(Ordering::Acquire).to_be_bytes();
         RosTime {
@@ -96,6 +97,18 @@ impl RosTime {
             },
         )
     }
+}
+
+/// Returns the wall clock time in nanoseconds since 1970; a time before 1970 is 0.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "the only place of the node that reads the wall clock"
+)]
+pub(crate) fn unix_nanos() -> i128 {
+    let since = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default();
+    i128::try_from(since.as_nanos()).unwrap_or(i128::MAX)
 }
 
 /// The topic of the simulated time.

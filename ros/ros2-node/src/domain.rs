@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 use std::pin::Pin;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -29,7 +29,7 @@ use crate::graph::{BRIDGE_TYPE, Graph, bridge_topic};
 use crate::node::{Channels, Node, NodeOptions, ParticipantPrefix, Services};
 use crate::qos::{Offered, Requested};
 use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
-use crate::rosout;
+use crate::rosout::{self, Rosout};
 use crate::security::{Enclave, SecurityError};
 use crate::service::peers::{changes_of, offered};
 
@@ -159,7 +159,7 @@ pub enum DomainError {
 /// A participant of a domain that is a ROS node there.
 ///
 /// `ros2 node list` shows the node with the readers and writers created here. The node publishes
-/// the process's warnings on `/rosout`, and with `use_sim_time` follows `/clock`.
+/// the records of [`Domain::rosout`], and with `use_sim_time` follows `/clock`.
 pub struct Domain {
     // Fields are dropped in this order: the node withdraws its name first, while the participant
     // can still announce it.
@@ -327,13 +327,15 @@ impl Domain {
     }
 
     /// Returns the full names of the nodes of a participant, as announced.
-    pub(crate) fn nodes_of(&self, participant: &ParticipantPrefix) -> Vec<String> {
+    #[must_use]
+    pub fn nodes_of(&self, participant: &ParticipantPrefix) -> Vec<String> {
         self.node.nodes_of(participant)
     }
 
     /// Returns whether the node's thread has ended by a panic, so that nodes are no longer
     /// announced.
-    pub(crate) fn is_mute(&self) -> bool {
+    #[must_use]
+    pub fn is_mute(&self) -> bool {
         self.node.is_mute()
     }
 
@@ -341,6 +343,13 @@ impl Domain {
     #[must_use]
     pub fn malformed_lists(&self) -> u64 {
         self.node.malformed_lists()
+    }
+
+    /// Returns the queue of log records that the node publishes on `/rosout`. The program passes
+    /// its warnings and errors to it.
+    #[must_use]
+    pub fn rosout(&self) -> Option<Arc<Rosout>> {
+        self.node.rosout()
     }
 
     /// Returns the clock of the node.
@@ -448,7 +457,7 @@ impl Domain {
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
-    pub(crate) fn announce_bridge(&self, space: u16) -> Result<RawWriter, DomainError> {
+    pub fn announce_bridge(&self, space: u16) -> Result<RawWriter, DomainError> {
         let qos = QosPolicyBuilder::new()
             .reliable(rustdds::Duration::ZERO)
             .build();

@@ -4,9 +4,9 @@
 //! its graph events name built-in entities. A snapshot of its database is complete at that moment.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-use mappings::SpaceId;
 use messages::TypeHash;
 use rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
 use rustdds::policy::{Durability, Reliability};
@@ -66,7 +66,8 @@ impl Endpoint {
 
     /// Returns whether the endpoint has the type, and the definition with the hash. An unknown hash
     /// on either side matches.
-    pub(crate) fn is_of(&self, dds_type: &str, hash: Option<TypeHash>) -> bool {
+    #[must_use]
+    pub fn is_of(&self, dds_type: &str, hash: Option<TypeHash>) -> bool {
         let differ = self.type_hash.zip(hash).is_some_and(|(a, b)| a != b);
         self.type_name == dds_type && !differ
     }
@@ -236,8 +237,8 @@ pub fn bridge_topic(space: u16) -> String {
 /// belong to no domain.
 fn bridge_of(dds_topic: &str, dds_type: &str) -> Option<u16> {
     let space = dds_topic.strip_prefix(BRIDGE_PREFIX)?.parse().ok()?;
-    let is_ros2 = SpaceId::new(space).is_some_and(SpaceId::is_ros2);
-    let is_said = is_ros2 && dds_type == BRIDGE_TYPE && dds_topic == bridge_topic(space);
+    let is_said =
+        ROS2_SPACES.contains(&space) && dds_type == BRIDGE_TYPE && dds_topic == bridge_topic(space);
     is_said.then_some(space)
 }
 
@@ -273,6 +274,8 @@ fn is_durable(durability: Option<Durability>) -> bool {
 
 /// The prefix of ROS 2 topic names (design.ros2.org, topic and service names).
 const TOPIC_PREFIX: &str = "rt/";
+/// The spaces that can belong to a domain.
+const ROS2_SPACES: RangeInclusive<u16> = 2..=232;
 const BRIDGE_PREFIX: &str = "ua_bridge_";
 /// The type of the bridge topic, on which no sample is ever sent.
 pub const BRIDGE_TYPE: &str = "ua_bridge::Presence_";

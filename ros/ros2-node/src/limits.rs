@@ -4,8 +4,6 @@
 //! complete if its burst overflows the receiver's socket buffer. The patches in `patches/` change
 //! that; `cargo xtask` builds with them.
 
-use std::sync::LazyLock;
-
 use crate::graph::Endpoint;
 
 /// True with the patched RustDDS.
@@ -18,19 +16,12 @@ pub const RUSTDDS: &str = if PATCHED {
     "RustDDS 0.15.1 as published, samples up to 256 kB to Fast DDS, 2 MB to others"
 };
 
-const SECURITY: &str = if cfg!(feature = "security") {
+/// Whether DDS Security is supported, for log messages and versions.
+pub const SECURITY: &str = if cfg!(feature = "security") {
     "with DDS Security"
 } else {
     "without DDS Security"
 };
-
-/// Returns the version of this program and of its RustDDS.
-#[must_use]
-pub fn version() -> &'static str {
-    static VERSION: LazyLock<String> =
-        LazyLock::new(|| format!("{} ({RUSTDDS}, {SECURITY})", build_info::version()));
-    &VERSION
-}
 
 /// Returns the size in bytes of the largest serialized sample that all readers with the system's
 /// default socket buffers receive. A larger sample is not written, but refused
@@ -75,7 +66,7 @@ mod tests {
 
     #[test]
     fn the_text_names_the_version_that_is_locked() {
-        let lock = include_str!("../../Cargo.lock");
+        let lock = include_str!("../../../Cargo.lock");
         let (_, package) = lock.split_once("name = \"rustdds\"\nversion = \"").unwrap();
         let (version, _) = package.split_once('"').unwrap();
         assert!(
@@ -88,7 +79,7 @@ mod tests {
     #[test]
     fn the_text_counts_the_patches() {
         let own = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
-        let folder = own.join("../patches/rustdds-0.15.1");
+        let folder = own.join("../../patches/rustdds-0.15.1");
         let count = std::fs::read_dir(folder)
             .unwrap()
             .filter(|entry| {

@@ -214,13 +214,18 @@ impl Node {
             return;
         };
         let rosout = Arc::new(Rosout::new(self.shared.clock.clone(), thread.clone()));
-        bridge_node::hear_log(crate::entry::NAME, &rosout);
         *lock(&self.shared.services) = Some((services, rosout));
         thread.unpark();
     }
 
     pub(crate) fn options(&self) -> &NodeOptions {
         &self.shared.options
+    }
+
+    /// Returns the queue of `/rosout`, once the node serves it.
+    pub(crate) fn rosout(&self) -> Option<Arc<Rosout>> {
+        let services = lock(&self.shared.services);
+        services.as_ref().map(|(_, rosout)| Arc::clone(rosout))
     }
 
     pub(crate) fn clock(&self) -> RosClock {

@@ -11,8 +11,6 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use bridge_node::policy::NO_SUBSCRIBER;
-use bridge_node::{Handover, Reason};
 use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
@@ -89,9 +87,19 @@ struct Settling {
     patience: Duration,
 }
 
+/// The progress of the samples that were offered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Progress {
+    /// The topic has no reader.
+    NoReader,
+    /// Samples wait for readers or for room in the send window.
+    Waiting,
+    /// Every sample was written.
+    Written,
+}
+
 /// The reason for which a sample was not delivered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
 pub enum Refusal {
     /// The send window and the queue are full: the oldest waiting sample was dropped for this
     /// sample.
@@ -108,24 +116,13 @@ pub enum Refusal {
 }
 
 impl Refusal {
-    /// Returns the counter and the label under which the refusal is counted.
-    #[must_use]
-    pub fn cause(self) -> (Reason, &'static str) {
-        let reason = match self {
-            Self::Overflow => Reason::Overflow,
-            Self::NoReader => Reason::NoSubscriber,
-            Self::TooLarge(_) | Self::Late | Self::Failed => Reason::NotPublished,
-        };
-        (reason, self.label())
-    }
-
     /// Returns the label under which the refusal is counted.
     #[must_use]
     pub fn label(self) -> &'static str {
         match self {
             Self::Overflow => "subscriber too slow",
             Self::TooLarge(_) => "too large for DDS",
-            Self::NoReader => NO_SUBSCRIBER,
+            Self::NoReader => "no subscriber is present",
             Self::Late => "subscriber not ready in time",
             Self::Failed => "DDS writer failed",
         }
@@ -330,13 +327,13 @@ impl Outlet {
         )
     }
 
-    /// Returns the handover of the last offered sample.
+    /// Returns the progress of the samples that were offered.
     #[must_use]
-    pub fn handover(&self) -> Handover {
+    pub fn progress(&self) -> Progress {
         match self.audience {
-            Audience::Nobody { .. } => Handover::Nobody,
-            Audience::Present { .. } if self.waiting.is_empty() => Handover::Done,
-            Audience::Present { .. } => Handover::Waiting,
+            Audience::Nobody { .. } => Progress::NoReader,
+            Audience::Present { .. } if self.waiting.is_empty() => Progress::Written,
+            Audience::Present { .. } => Progress::Waiting,
         }
     }
 

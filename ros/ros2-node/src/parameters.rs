@@ -9,7 +9,6 @@ mod value;
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use bridge_node::now;
 use bytes::Bytes;
 use messages::{Dialect, Registry, TypeName};
 use rustdds::policy::{Durability, History};
@@ -21,6 +20,7 @@ pub use self::value::ParameterValue;
 
 use self::store::{Question, Store};
 use crate::cdr::Malformed;
+use crate::clock::unix_nanos;
 use crate::domain::{Domain, DomainError};
 use crate::raw::{Payload, Writer};
 use crate::service::{Service, ServiceCounters, ServiceOptions, ServicePeers, ServiceServer};
@@ -112,7 +112,7 @@ impl Shared {
             for Parameter { name, value, .. } in &changed {
                 info!(parameter = name, ?value, "parameter set");
             }
-            let event = store::event(&self.node, now().utc.unix_nanos(), &changed);
+            let event = store::event(&self.node, unix_nanos(), &changed);
             let written = Payload::to_write(event).map(|event| {
                 let events = self.events.lock().unwrap_or_else(PoisonError::into_inner);
                 events.write(event, None).is_ok()

@@ -24,7 +24,8 @@ pub struct Requested {
 
 impl Requested {
     /// Returns whether earlier samples are requested as well.
-    pub(crate) const fn is_transient_local(self) -> bool {
+    #[must_use]
+    pub const fn is_transient_local(self) -> bool {
         self.transient_local
     }
 

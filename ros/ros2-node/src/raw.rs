@@ -93,9 +93,9 @@ pub type Reader = Listed<RawReader>;
 /// A writer of [`Payload`]s, on the list of its node.
 pub type Writer = Listed<RawWriter>;
 /// A reader that returns [`Payload`]s.
-pub(crate) type RawReader = no_key::SimpleDataReader<Payload, Opaque>;
+pub type RawReader = no_key::SimpleDataReader<Payload, Opaque>;
 /// A writer of [`Payload`]s.
-pub(crate) type RawWriter = no_key::DataWriter<Payload, Opaque>;
+pub type RawWriter = no_key::DataWriter<Payload, Opaque>;
 
 impl DeserializerAdapter<Payload> for Opaque {
     type Error = std::convert::Infallible;

@@ -1,11 +1,11 @@
-//! `/rosout`: publishes the process's warnings as messages of the graph.
+//! `/rosout`: publishes log records of the program as messages of the graph.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::Thread;
 
-use bridge_node::{LogRecord, LogSink};
 use bytes::{BufMut, Bytes};
+use log_limit::{LogRecord, LogSink};
 use rustdds::policy::{Durability, History, Lifespan, ResourceLimits};
 use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 use tracing::Level;
@@ -15,7 +15,7 @@ use crate::discovery_info::Cdr;
 
 /// Collects warnings and errors of all threads, for the node's thread to publish.
 #[derive(Debug)]
-pub(crate) struct Rosout {
+pub struct Rosout {
     waiting: Mutex<Waiting>,
     clock: RosClock,
     publisher: Thread,

@@ -8,6 +8,7 @@
 
 #[cfg(feature = "security")]
 mod files;
+pub mod rejections;
 
 use std::path::{Path, PathBuf};
 

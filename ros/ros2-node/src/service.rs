@@ -22,17 +22,15 @@ use messages::{ServiceTypeHashes, TypeName};
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{QosPolicies, QosPolicyBuilder};
 
-pub use self::client::{ServiceClient, ServiceClientOptions};
+pub use self::client::{Recall, Replied, ServiceClient, ServiceClientOptions};
 pub use self::error::{CallPhase, ServiceError};
 pub use self::mapping::ServiceMapping;
-pub use self::peers::ServicePeers;
+pub use self::peers::{ServicePeers, Snapshot, action_type, service_type};
 pub use self::server::{ServiceCounters, ServiceOptions, ServiceRequest, ServiceServer};
 
 pub(crate) use self::audience::Audience;
-pub(crate) use self::client::{Recall, Replied};
 pub(crate) use self::mapping::Received;
 pub(crate) use self::opening::Opening;
-pub(crate) use self::peers::{Snapshot, action_type, service_type};
 pub(crate) use self::server::{Answer, Never};
 use crate::domain::Domain;
 use crate::raw::Reader;
@@ -84,7 +82,7 @@ impl Service {
     }
 
     /// Sets the type hashes that the domain announces with the next endpoints of the service.
-    pub(crate) fn announce(&self, domain: &Domain, hashes: &ServiceTypeHashes) {
+    pub fn announce(&self, domain: &Domain, hashes: &ServiceTypeHashes) {
         domain.learn_type_hash(&self.types.request, hashes.request.to_string());
         domain.learn_type_hash(&self.types.response, hashes.response.to_string());
     }

@@ -26,26 +26,26 @@ struct Description {
 
 /// The source of a type, in the format of `type_description_interfaces/msg/TypeSource`.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct TypeSource {
+pub struct TypeSource {
     /// The full name of the type.
-    pub(crate) name: String,
+    pub name: String,
     /// The extension of its file, or `implicit` for a type without its own file.
-    pub(crate) encoding: &'static str,
+    pub encoding: &'static str,
     /// The contents of its file.
-    pub(crate) text: String,
+    pub text: String,
 }
 
 /// Serves the descriptions of the types that this node reads and writes. Dropping it withdraws the
 /// service.
 #[derive(Debug)]
-pub(crate) struct TypeServer {
+pub struct TypeServer {
     known: Arc<Mutex<Known>>,
     server: ServiceServer,
 }
 
 impl TypeServer {
     /// Opens the service of the domain's node. Call this on a tokio runtime.
-    pub(crate) fn open(domain: &Domain, peers: &ServicePeers) -> Result<Self, DomainError> {
+    pub fn open(domain: &Domain, peers: &ServicePeers) -> Result<Self, DomainError> {
         let service = service(&domain.node_name());
         let hashes = TypeName::new(PACKAGE, SERVICE)
             .ok()
@@ -68,12 +68,7 @@ impl TypeServer {
     }
 
     /// Adds a type that is read, written or served, with its referenced types.
-    pub(crate) fn learn(
-        &self,
-        types: Vec<DescribedType>,
-        sources: Vec<TypeSource>,
-        hash: TypeHash,
-    ) {
+    pub fn learn(&self, types: Vec<DescribedType>, sources: Vec<TypeSource>, hash: TypeHash) {
         let Some(first) = types.first() else {
             return;
         };
@@ -83,19 +78,22 @@ impl TypeServer {
     }
 
     /// Returns whether the type is served already.
-    pub(crate) fn tells(&self, full: &str, hash: TypeHash) -> bool {
+    #[must_use]
+    pub fn tells(&self, full: &str, hash: TypeHash) -> bool {
         let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         known.contains_key(&(full.to_owned(), hash))
     }
 
     /// Returns the counters of the service.
-    pub(crate) fn counters(&self) -> ServiceCounters {
+    #[must_use]
+    pub fn counters(&self) -> ServiceCounters {
         self.server.counters()
     }
 }
 
 /// Returns the service of a node.
-pub(crate) fn service(node: &str) -> Service {
+#[must_use]
+pub fn service(node: &str) -> Service {
     let of = |half| format!("type_description_interfaces::srv::dds_::GetTypeDescription_{half}_");
     Service {
         name: format!("{node}/get_type_description"),
@@ -107,7 +105,8 @@ pub(crate) fn service(node: &str) -> Service {
 }
 
 /// Encodes a request for a type without its sources.
-pub(crate) fn request(name: &TypeName, hash: TypeHash) -> Bytes {
+#[must_use]
+pub fn request(name: &TypeName, hash: TypeHash) -> Bytes {
     let mut writer = CdrWriter::new();
     writer.string(&name.ros2());
     writer.string(&hash.to_string());
@@ -116,7 +115,7 @@ pub(crate) fn request(name: &TypeName, hash: TypeHash) -> Bytes {
 }
 
 /// Decodes the type and its referenced types, or the reason for the failure.
-pub(crate) fn read_answer(bytes: &[u8]) -> Result<Vec<DescribedType>, String> {
+pub fn read_answer(bytes: &[u8]) -> Result<Vec<DescribedType>, String> {
     let read = || -> Result<Result<Vec<DescribedType>, String>, Malformed> {
         let mut reader = CdrReader::new(bytes)?;
         let successful = reader.bool()?;

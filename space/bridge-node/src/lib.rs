@@ -56,7 +56,8 @@ pub use definitions::Definitions;
 pub use executing::{Executing, ExecutorGraph};
 pub use exit::{Failure, FailureKind};
 pub use keys::{Fetched, Fetching, KeyRequest, KeyService};
-pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
+pub use log_limit::{LogRecord, LogSink};
+pub use logging::{LogFormat, hear_log};
 pub use mapping_file::{ConfigurationFile, NodeSetReader};
 pub use mappings::harmless_json;
 pub use metrics::{

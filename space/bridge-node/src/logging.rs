@@ -8,6 +8,7 @@ use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write};
 use std::sync::{Arc, PoisonError, RwLock, Weak};
 
+use log_limit::{LogRecord, LogSink};
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id};
 use tracing::{Event, Level, Span, Subscriber, error_span};
@@ -117,27 +118,6 @@ fn escaped(text: &str, stay: impl Fn(char) -> bool) -> Cow<'_, str> {
         }
     }
     Cow::Owned(out)
-}
-
-/// A warning or an error of the program.
-#[derive(Debug, Clone)]
-pub struct LogRecord {
-    /// The level: warning or error.
-    pub level: Level,
-    /// The message, followed by the fields.
-    pub message: String,
-    /// The source file.
-    pub file: Option<&'static str>,
-    /// The module.
-    pub module: Option<&'static str>,
-    /// The line in the file.
-    pub line: Option<u32>,
-}
-
-/// A receiver of the program's warnings and errors beside stderr.
-pub trait LogSink: Send + Sync + 'static {
-    /// Receives one record. Called on the thread that logs, so it must neither wait nor log.
-    fn hear(&self, record: LogRecord);
 }
 
 /// Registers `sink` for every warning and error of our own crates while it is alive. Messages of
@@ -257,7 +237,7 @@ impl Visit for Text {
 }
 
 /// Prefixes of the crates with forwarded warnings.
-const OURS: [&str; 4] = ["bridge_", "tcpros", "transport", "uadp"];
+const OURS: [&str; 5] = ["bridge_", "ros2_node", "tcpros", "transport", "uadp"];
 
 #[cfg(test)]
 mod tests {

@@ -1,6 +1,6 @@
 //! Actions with a peer on Fast DDS.
 
-use bridge_ros2::action::{CancelCode, Outcome, Status};
+use ros2_node::action::{CancelCode, Outcome, Status};
 use serde_json::{Value, json};
 use system_tests::{Cell, Peer};
 

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use bridge_ros2::action::Action;
-use bridge_ros2::domain::{Domain, DomainOptions};
-use bridge_ros2::service::ServicePeers;
 use bytes::Bytes;
+use ros2_node::action::Action;
+use ros2_node::domain::{Domain, DomainOptions};
+use ros2_node::service::ServicePeers;
 
 /// The timeout of a peer.
 pub(crate) const SOON: Duration = Duration::from_secs(20);

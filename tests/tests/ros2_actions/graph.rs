@@ -2,8 +2,8 @@
 
 use std::collections::BTreeSet;
 
-use bridge_ros2::domain::can_announce_type_hashes;
 use messages::{ActionTypeHashes, Dialect, Registry, TypeHash};
+use ros2_node::domain::can_announce_type_hashes;
 use serde_json::Value;
 use system_tests::{Cell, Child, Peer};
 

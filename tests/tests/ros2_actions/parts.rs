@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use bridge_ros2::action::{CancelCode, GoalEvent, Status};
-use bridge_ros2::qos::Offered;
-use bridge_ros2::service::{Service, ServiceOptions, ServiceServer, ServiceTypes};
 use bytes::Bytes;
+use ros2_node::action::{CancelCode, GoalEvent, Status};
+use ros2_node::qos::Offered;
+use ros2_node::service::{Service, ServiceOptions, ServiceServer, ServiceTypes};
 use system_tests::Cell;
 use tokio::time::timeout;
 

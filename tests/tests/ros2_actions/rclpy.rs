@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::time::Duration;
 
-use bridge_ros2::action::{
+use messages::{Dialect, Registry, TypeName};
+use nix::sys::signal::Signal;
+use ros2_node::action::{
     Action, ActionClient, ActionServerOptions, CancelCode, CancelWhat, GoalId, LostReason, Outcome,
     Status,
 };
-use bridge_ros2::domain::can_announce_type_hashes;
-use bridge_ros2::service::ServiceError;
-use messages::{Dialect, Registry, TypeName};
-use nix::sys::signal::Signal;
+use ros2_node::domain::can_announce_type_hashes;
+use ros2_node::service::ServiceError;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Distribution, Peer, Started};
 use tokio::time::timeout;

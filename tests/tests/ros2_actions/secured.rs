@@ -1,9 +1,9 @@
 //! Actions with DDS Security on both sides.
 
-use bridge_ros2::action::{CancelCode, Outcome, Status};
-use bridge_ros2::domain::{Domain, DomainOptions};
-use bridge_ros2::security::Enclave;
-use bridge_ros2::service::ServicePeers;
+use ros2_node::action::{CancelCode, Outcome, Status};
+use ros2_node::domain::{Domain, DomainOptions};
+use ros2_node::security::Enclave;
+use ros2_node::service::ServicePeers;
 use serde_json::json;
 use system_tests::{Cell, Keystore, Peer};
 

@@ -4,12 +4,12 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_ros2::action::{
+use bytes::Bytes;
+use nix::sys::signal::Signal;
+use ros2_node::action::{
     Action, ActionServer, ActionServerOptions, GoalError, NewGoal, ServerCounters, ServerEvent,
     ServerGoal,
 };
-use bytes::Bytes;
-use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Peer};
 use tokio::sync::{Semaphore, watch};

@@ -3,14 +3,14 @@
 use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
 
-use bridge_ros2::domain::Domain;
-use bridge_ros2::graph::Graph;
-use bridge_ros2::inbox::{Inbox, Taken};
-use bridge_ros2::limits::PATCHED;
-use bridge_ros2::outlet::Outlet;
-use bridge_ros2::qos::{Offered, Requested};
-use bridge_ros2::raw::Payload;
 use nix::sys::signal::Signal;
+use ros2_node::domain::Domain;
+use ros2_node::graph::Graph;
+use ros2_node::inbox::{Inbox, Taken};
+use ros2_node::limits::PATCHED;
+use ros2_node::outlet::Outlet;
+use ros2_node::qos::{Offered, Requested};
+use ros2_node::raw::Payload;
 use serde_json::Value;
 use system_tests::{Cell, Peer, eventually};
 

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use bridge_ros2::domain::DomainOptions;
+use ros2_node::domain::DomainOptions;
 use system_tests::{Cell, Child};
 
 /// The domain of the tests.

@@ -4,10 +4,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bridge_node::{Delivery, Kept, Port, PortEvent, Reason, TypePaths};
-use bridge_ros2::limits::PATCHED;
 use bridge_ros2::{PortOptions, Ros2Port};
 use mappings::{Mapping, SpaceId, TopicId};
 use nix::sys::signal::Signal;
+use ros2_node::limits::PATCHED;
 use serde_json::json;
 use system_tests::{Cell, Child, Peer};
 use uadp::BuiltinType;

@@ -3,11 +3,11 @@
 use std::time::Duration;
 
 use bridge_node::{Delivery, Kept, Port, PortEvent};
-use bridge_ros2::domain::{Domain, DomainOptions, can_announce_type_hashes};
-use bridge_ros2::qos::{Offered, Requested};
-use bridge_ros2::raw::Payload;
 use mappings::Mapping;
 use messages::{Dialect, Registry};
+use ros2_node::domain::{Domain, DomainOptions, can_announce_type_hashes};
+use ros2_node::qos::{Offered, Requested};
+use ros2_node::raw::Payload;
 use serde_json::json;
 use system_tests::{Cell, Peer, eventually};
 use uadp::BuiltinType;

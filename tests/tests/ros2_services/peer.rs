@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use bridge_ros2::domain::{Domain, DomainOptions};
-use bridge_ros2::service::ServicePeers;
+use ros2_node::domain::{Domain, DomainOptions};
+use ros2_node::service::ServicePeers;
 use system_tests::{Cell, Child, Peer};
 
 /// The timeout of a peer.

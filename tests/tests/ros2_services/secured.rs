@@ -1,8 +1,8 @@
 //! Secured clients of both vendors.
 
-use bridge_ros2::domain::{Domain, DomainOptions};
-use bridge_ros2::security::Enclave;
-use bridge_ros2::service::{ServiceOptions, ServicePeers};
+use ros2_node::domain::{Domain, DomainOptions};
+use ros2_node::security::Enclave;
+use ros2_node::service::{ServiceOptions, ServicePeers};
 use system_tests::{Cell, Keystore, Peer};
 
 use crate::ros2_services::peer::{Ours, SET_BOOL, until};

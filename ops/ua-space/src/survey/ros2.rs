@@ -2,12 +2,12 @@
 
 use std::time::Duration;
 
-use bridge_ros2::domain::{DiscoveryRange, Domain, DomainOptions};
-use bridge_ros2::graph::{Endpoint, Graph, ros_topic};
-use bridge_ros2::node::NodeOptions;
-use bridge_ros2::security::Security;
 use mappings::{LiveSpace, LiveTopic};
 use messages::TypeName;
+use ros2_node::domain::{DiscoveryRange, Domain, DomainOptions};
+use ros2_node::graph::{Endpoint, Graph, ros_topic};
+use ros2_node::node::NodeOptions;
+use ros2_node::security::Security;
 use tokio::time::{Instant, sleep};
 
 use super::{MOST, away};

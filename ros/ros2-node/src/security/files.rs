@@ -2,7 +2,8 @@
 //! without the file to fix, and checks neither the dates of certificates nor the file mode of a
 //! key.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io::Read as _;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 
@@ -56,8 +57,14 @@ pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
 }
 
 fn read(folder: &Path, file: &str) -> Result<Vec<u8>, SecurityError> {
-    bridge_node::read_bounded(&folder.join(file), LARGEST)
-        .map_err(|error| Enclave::fault(folder, file, format!("cannot be read: {error}")))
+    let mut bytes = Vec::new();
+    File::open(folder.join(file))
+        .and_then(|opened| opened.take(LARGEST + 1).read_to_end(&mut bytes))
+        .map_err(|error| Enclave::fault(folder, file, format!("cannot be read: {error}")))?;
+    match u64::try_from(bytes.len()) {
+        Ok(length) if length <= LARGEST => Ok(bytes),
+        _ => Err(Enclave::fault(folder, file, "it is larger than 4 MiB")),
+    }
 }
 
 /// Maximum size of a file of an enclave in bytes.

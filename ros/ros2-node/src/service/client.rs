@@ -182,9 +182,12 @@ impl ServiceClient {
         self.call_recallable(request, endpoint, &recall).await
     }
 
-    /// Calls as [`call_after`](Self::call_after) does, with a request that can be
+    /// Calls the service, after the server of `endpoint` was discovered, with a request that can be
     /// [recalled](Recall::recall) until it is sent.
-    pub(crate) async fn call_recallable(
+    ///
+    /// # Errors
+    /// [`ServiceError`].
+    pub async fn call_recallable(
         &self,
         request: Bytes,
         endpoint: Option<GUID>,
@@ -238,7 +241,7 @@ impl ServiceClient {
 
 /// Recalls a request that was not sent yet.
 #[derive(Debug, Clone)]
-pub(crate) struct Recall(Arc<AtomicU8>);
+pub struct Recall(Arc<AtomicU8>);
 
 impl Default for Recall {
     fn default() -> Self {
@@ -248,12 +251,13 @@ impl Default for Recall {
 
 impl Recall {
     /// Returns whether the request was sent.
-    pub(crate) fn is_sent(&self) -> bool {
+    #[must_use]
+    pub fn is_sent(&self) -> bool {
         self.0.load(Ordering::Acquire) == u8::from(CallPhase::Answer)
     }
 
     /// Prevents the request from being sent. Returns false if it was sent or is being sent.
-    pub(crate) fn recall(&self) -> bool {
+    pub fn recall(&self) -> bool {
         let before = |phase: u8| (phase < CallPhase::Request.into()).then_some(RECALLED);
         let moved = self
             .0
@@ -264,9 +268,11 @@ impl Recall {
 
 /// The reply of a server and the writer that sent it.
 #[derive(Debug)]
-pub(crate) struct Replied {
-    pub(crate) reply: Bytes,
-    pub(crate) writer: GUID,
+pub struct Replied {
+    /// The reply, with its encapsulation header.
+    pub reply: Bytes,
+    /// The writer of the server.
+    pub writer: GUID,
 }
 
 #[derive(Debug)]

@@ -34,7 +34,7 @@ struct Seen {
 
 /// A snapshot of the endpoints, by DDS topic.
 #[derive(Debug, Default)]
-pub(crate) struct Snapshot {
+pub struct Snapshot {
     readers: BTreeMap<String, Vec<Endpoint>>,
     writers: BTreeMap<String, Vec<Endpoint>>,
 }
@@ -53,7 +53,8 @@ impl ServicePeers {
     /// Returns a snapshot no older than `age`. Discovery data is not copied again while its change
     /// count stays the same: with thousands of endpoints, a copy costs more than all other work of
     /// an idle bridge.
-    pub(crate) fn look(&self, now: Instant, age: Duration) -> Arc<Snapshot> {
+    #[must_use]
+    pub fn look(&self, now: Instant, age: Duration) -> Arc<Snapshot> {
         let mut seen = self.0.seen.lock().unwrap_or_else(PoisonError::into_inner);
         let fresh = seen
             .as_ref()
@@ -80,11 +81,12 @@ impl ServicePeers {
     }
 
     /// Returns a snapshot that has all changes so far. With the published RustDDS, which does not
-    /// count changes, the snapshot may be as old as [`SEEN`].
+    /// count changes, the snapshot may be 100 ms old.
     ///
     /// A pass that is made because of a change must not judge by an older snapshot, since it is not
     /// made again.
-    pub(crate) fn current(&self, now: Instant) -> Arc<Snapshot> {
+    #[must_use]
+    pub fn current(&self, now: Instant) -> Arc<Snapshot> {
         let age = changes_of(&self.0.participant).map_or(SEEN, |_| Duration::ZERO);
         self.look(now, age)
     }
@@ -160,31 +162,35 @@ impl Snapshot {
         snapshot
     }
 
-    pub(crate) fn readers(&self, topic: &str) -> &[Endpoint] {
+    /// Returns the readers of a DDS topic of a service or action.
+    #[must_use]
+    pub fn readers(&self, topic: &str) -> &[Endpoint] {
         self.readers.get(topic).map_or(&[], Vec::as_slice)
     }
 
-    pub(crate) fn writers(&self, topic: &str) -> &[Endpoint] {
+    /// Returns the writers of a DDS topic of a service or action.
+    #[must_use]
+    pub fn writers(&self, topic: &str) -> &[Endpoint] {
         self.writers.get(topic).map_or(&[], Vec::as_slice)
     }
 
     /// Returns the offered services, each with the readers of its requests.
-    pub(crate) fn offered(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    pub fn offered(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
         named(&self.readers, service_name)
     }
 
     /// Returns the called services, each with the writers of its requests.
-    pub(crate) fn called(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    pub fn called(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
         named(&self.writers, service_name)
     }
 
     /// Returns the served actions, each with the readers of its goals.
-    pub(crate) fn served_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    pub fn served_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
         named(&self.readers, action_name)
     }
 
     /// Returns the actions that receive goals from clients, each with the writers of its goals.
-    pub(crate) fn called_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    pub fn called_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
         named(&self.writers, action_name)
     }
 }
@@ -226,7 +232,8 @@ pub(crate) fn offered(
 }
 
 /// Converts `std_srvs::srv::dds_::SetBool_Request_` to `std_srvs/SetBool`.
-pub(crate) fn service_type(request: &str) -> String {
+#[must_use]
+pub fn service_type(request: &str) -> String {
     let parts = request.split_once("::srv::dds_::");
     let named = parts.and_then(|(package, rest)| Some((package, rest.strip_suffix("_Request_")?)));
     named.map_or_else(
@@ -237,7 +244,8 @@ pub(crate) fn service_type(request: &str) -> String {
 
 /// Converts `nav2_msgs::action::dds_::NavigateToPose_SendGoal_Request_` to
 /// `nav2_msgs/NavigateToPose`.
-pub(crate) fn action_type(request: &str) -> String {
+#[must_use]
+pub fn action_type(request: &str) -> String {
     let parts = request.split_once("::action::dds_::");
     let named =
         parts.and_then(|(package, rest)| Some((package, rest.strip_suffix("_SendGoal_Request_")?)));

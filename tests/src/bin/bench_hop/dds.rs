@@ -3,10 +3,10 @@
 use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
-use bridge_ros2::domain::{Domain, DomainOptions};
-use bridge_ros2::qos::Requested;
-use bridge_ros2::raw::Reader as RawReader;
 use futures_util::StreamExt;
+use ros2_node::domain::{Domain, DomainOptions};
+use ros2_node::qos::Requested;
+use ros2_node::raw::Reader as RawReader;
 use tokio::runtime::Runtime;
 
 /// A reader of a topic of std_msgs/String in domain 2.

@@ -11,8 +11,9 @@ use tokio::time::Instant;
 
 use crate::node::ParticipantPrefix;
 
+/// The participants under authentication, and the rejected participants.
 #[derive(Debug, Default)]
-pub(super) struct Strangers {
+pub struct Rejections {
     /// Participants under authentication, with the start time.
     waiting: BTreeMap<ParticipantPrefix, Instant>,
     /// Participants that were logged, oldest first.
@@ -21,19 +22,19 @@ pub(super) struct Strangers {
 
 /// A participant that is not admitted.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) struct Stranger {
+pub struct Rejection {
     participant: ParticipantPrefix,
     why: &'static str,
 }
 
-impl Strangers {
+impl Rejections {
     /// Records a discovery event; the caller logs and counts the returned participant.
     #[cfg(feature = "security")]
-    pub(super) fn note(
+    pub fn note(
         &mut self,
         event: &DomainParticipantStatusEvent,
         now: Instant,
-    ) -> Option<Stranger> {
+    ) -> Option<Rejection> {
         if let DomainParticipantStatusEvent::ParticipantLost { id, .. } = event {
             let gone: ParticipantPrefix = id.as_ref().try_into().ok()?;
             self.waiting.remove(&gone);
@@ -50,11 +51,11 @@ impl Strangers {
 
     /// Returns `None`: without DDS Security no participant is rejected.
     #[cfg(not(feature = "security"))]
-    pub(super) const fn note(
+    pub const fn note(
         &mut self,
         _event: &DomainParticipantStatusEvent,
         _now: Instant,
-    ) -> Option<Stranger> {
+    ) -> Option<Rejection> {
         None
     }
 
@@ -64,7 +65,7 @@ impl Strangers {
         participant: ParticipantPrefix,
         status: AuthenticationStatus,
         now: Instant,
-    ) -> Option<Stranger> {
+    ) -> Option<Rejection> {
         match status {
             AuthenticationStatus::Authenticating => {
                 if self.waiting.len() < MAX_WAITING {
@@ -79,42 +80,42 @@ impl Strangers {
             AuthenticationStatus::Rejected => {
                 self.waiting.remove(&participant);
                 let why = "it has no DDS Security, other governance settings, or no permission in this domain";
-                Some(Stranger { participant, why })
+                Some(Rejection { participant, why })
             }
         }
     }
 
     /// Returns whether the participant was not logged yet, and records it as logged. Each attempt
     /// may use another identity, so the oldest entries are dropped.
-    pub(super) fn is_new(&mut self, stranger: &Stranger) -> bool {
-        let is_new = !self.told.contains(&stranger.participant);
+    pub fn is_new(&mut self, rejection: &Rejection) -> bool {
+        let is_new = !self.told.contains(&rejection.participant);
         if is_new {
             if self.told.len() >= MAX_TOLD {
                 self.told.pop_front();
             }
-            self.told.push_back(stranger.participant);
+            self.told.push_back(rejection.participant);
         }
         is_new
     }
 
     /// Returns the participants that failed to authenticate in time, once each.
-    pub(super) fn overdue(&mut self, now: Instant) -> Vec<Stranger> {
+    pub fn overdue(&mut self, now: Instant) -> Vec<Rejection> {
         let late = |since: &Instant| now.saturating_duration_since(*since) > PATIENCE;
         let overdue = self.waiting.iter().filter(|(_, since)| late(since));
-        let strangers: Vec<Stranger> = overdue
-            .map(|(participant, _)| Stranger {
+        let rejections: Vec<Rejection> = overdue
+            .map(|(participant, _)| Rejection {
                 participant: *participant,
                 why: "it did not authenticate; its certificate may come from another identity CA",
             })
             .collect();
-        for stranger in &strangers {
-            self.waiting.remove(&stranger.participant);
+        for rejection in &rejections {
+            self.waiting.remove(&rejection.participant);
         }
-        strangers
+        rejections
     }
 }
 
-impl std::fmt::Display for Stranger {
+impl std::fmt::Display for Rejection {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str("participant ")?;
         for byte in self.participant {
@@ -124,8 +125,6 @@ impl std::fmt::Display for Stranger {
     }
 }
 
-/// The reason under which rejected participants are counted.
-pub(super) const KEPT_OUT: &str = "participant not authenticated";
 /// The time limit of a handshake of three messages, each repeated every second.
 const PATIENCE: Duration = Duration::from_secs(8);
 /// Maximum number of logged participants that are remembered.
@@ -140,35 +139,35 @@ mod tests {
 
     #[test]
     fn the_log_names_each_once_however_many_come() {
-        let mut strangers = Strangers::default();
-        let stranger = |number: u32| {
+        let mut rejections = Rejections::default();
+        let rejection = |number: u32| {
             let mut participant = [0; 12];
             participant[..4].copy_from_slice(&number.to_le_bytes());
-            Stranger {
+            Rejection {
                 participant,
                 why: "of the test",
             }
         };
         for number in 0..10_000 {
-            assert!(strangers.is_new(&stranger(number)), "{number}");
-            assert!(!strangers.is_new(&stranger(number)), "{number}");
+            assert!(rejections.is_new(&rejection(number)), "{number}");
+            assert!(!rejections.is_new(&rejection(number)), "{number}");
         }
-        assert!(strangers.told.len() <= MAX_TOLD);
+        assert!(rejections.told.len() <= MAX_TOLD);
     }
 
     #[test]
     fn who_does_not_prove_itself_in_time_is_told_once() {
-        let (mut strangers, start) = (Strangers::default(), Instant::now());
-        let mut turn = |who: u8, status, at| strangers.turn([who; 12], status, at);
+        let (mut rejections, start) = (Rejections::default(), Instant::now());
+        let mut turn = |who: u8, status, at| rejections.turn([who; 12], status, at);
         assert_eq!(turn(1, AuthenticationStatus::Authenticating, start), None);
         assert_eq!(turn(2, AuthenticationStatus::Authenticating, start), None);
         assert_eq!(turn(2, AuthenticationStatus::Authenticated, start), None);
         let refused = turn(3, AuthenticationStatus::Rejected, start).unwrap();
         assert!(refused.to_string().contains("030303"), "{refused}");
-        assert_eq!(strangers.overdue(start + PATIENCE), []);
+        assert_eq!(rejections.overdue(start + PATIENCE), []);
         let late = start + PATIENCE + Duration::from_millis(1);
-        let overdue = strangers.overdue(late);
+        let overdue = rejections.overdue(late);
         assert!(matches!(overdue.as_slice(), [one] if one.participant == [1; 12]));
-        assert_eq!(strangers.overdue(late), []);
+        assert_eq!(rejections.overdue(late), []);
     }
 }
