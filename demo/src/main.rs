@@ -1,5 +1,6 @@
 //! Scenarios with simulated robots and the released programs: the fault-tolerant product assembly
-//! line with skills, the same line with topics, plug and produce, the tool change, and a batch.
+//! line with skills, the same line with topics, plug and produce, the tool change, a batch, the
+//! insertion of fuses, and terminal blocks on a rail.
 //!
 //! All processes of the demo use the same binary. Without a subcommand it starts the others, which
 //! are hidden subcommands, and the other programs in its directory. The robots and the components
@@ -11,12 +12,13 @@
 //! - `line`: their shared values
 //! - `supervisor` and `orchestra`: the OPC UA client, and the process that starts and watches all
 //!   others
-//! - `skilled`, `plug`, `tools` and `batch`: the other scenarios
+//! - `skilled`, `plug`, `tools`, `batch`, `fuses` and `terminals`: the other scenarios
 //! - `stage`: the shared parts of the scenarios
 
 mod batch;
 mod clock;
 mod event;
+mod fuses;
 mod line;
 mod master;
 mod orchestra;
@@ -27,6 +29,7 @@ mod skilled;
 mod stage;
 mod stop;
 mod supervisor;
+mod terminals;
 mod tools;
 
 use std::io::Write as _;
@@ -89,6 +92,10 @@ enum Scenario {
     ToolChange,
     /// Three simulated process modules that a recipe of BatchML runs: dose, stir and react
     Batch,
+    /// An arm that inserts a fuse with a limited force and tries again; then an arm of another make does the same
+    Fuses,
+    /// A robot, a tool changer and a gripper that place terminal blocks onto a rail
+    Terminals,
 }
 
 /// The demo's own processes.
@@ -162,66 +169,76 @@ fn main() -> ExitCode {
         Err(error) => return complain(&anyhow::Error::new(error)),
     };
     match arguments.role {
-        None => {
-            let PlanArguments {
-                scenario,
-                speed,
-                covers,
-                conveyor_off_at,
-                manifest,
-                swap_tools,
-                open,
-                json,
-            } = arguments.plan;
-            let code = match scenario {
-                Scenario::LineByTopics => {
-                    let plan = Plan {
-                        covers,
-                        speed,
-                        conveyor_off_at,
-                        open,
-                        json,
-                    };
-                    runtime.block_on(Box::pin(orchestra::play(plan)))
-                }
-                Scenario::PlugAndProduce => {
-                    let plan = plug::Plan {
-                        speed,
-                        open,
-                        json,
-                        manifest,
-                    };
-                    runtime.block_on(Box::pin(plug::play(plan)))
-                }
-                Scenario::AssemblyLine => {
-                    let plan = skilled::Plan {
-                        covers,
-                        speed,
-                        open,
-                        json,
-                    };
-                    runtime.block_on(Box::pin(skilled::play(plan)))
-                }
-                Scenario::Batch => {
-                    let plan = batch::Plan { speed, json };
-                    runtime.block_on(Box::pin(batch::play(plan)))
-                }
-                Scenario::ToolChange => {
-                    let plan = tools::Plan {
-                        speed,
-                        open,
-                        json,
-                        swapped: swap_tools,
-                    };
-                    runtime.block_on(Box::pin(tools::play(plan)))
-                }
-            };
-            ExitCode::from(code)
-        }
+        None => ExitCode::from(play(arguments.plan, &runtime)),
         Some(role) => match runtime.block_on(Box::pin(play_role(role))) {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => complain(&error),
         },
+    }
+}
+
+/// Plays a story. Returns the exit code.
+fn play(plan: PlanArguments, runtime: &tokio::runtime::Runtime) -> u8 {
+    let PlanArguments {
+        scenario,
+        speed,
+        covers,
+        conveyor_off_at,
+        manifest,
+        swap_tools,
+        open,
+        json,
+    } = plan;
+    match scenario {
+        Scenario::LineByTopics => {
+            let plan = Plan {
+                covers,
+                speed,
+                conveyor_off_at,
+                open,
+                json,
+            };
+            runtime.block_on(Box::pin(orchestra::play(plan)))
+        }
+        Scenario::PlugAndProduce => {
+            let plan = plug::Plan {
+                speed,
+                open,
+                json,
+                manifest,
+            };
+            runtime.block_on(Box::pin(plug::play(plan)))
+        }
+        Scenario::AssemblyLine => {
+            let plan = skilled::Plan {
+                covers,
+                speed,
+                open,
+                json,
+            };
+            runtime.block_on(Box::pin(skilled::play(plan)))
+        }
+        Scenario::Batch => {
+            let plan = batch::Plan { speed, json };
+            runtime.block_on(Box::pin(batch::play(plan)))
+        }
+        Scenario::Fuses => {
+            let plan = fuses::Plan { speed, json };
+            runtime.block_on(Box::pin(fuses::play(plan)))
+        }
+        Scenario::Terminals => {
+            let plan = terminals::Plan { speed, json };
+            runtime.block_on(Box::pin(terminals::play(plan)))
+        }
+        Scenario::ToolChange => {
+            let plan = tools::Plan {
+                speed,
+                open,
+                json,
+                swapped: swap_tools,
+            };
+            runtime.block_on(Box::pin(tools::play(plan)))
+        }
     }
 }
 

@@ -142,3 +142,77 @@ fn a_robot_changes_its_tools_and_survives_the_loss_of_one_wherever_they_hang() {
         );
     }
 }
+
+/// Plays a story of processes to its end, and returns its report.
+fn told(scenario: &str, speed: &str) -> Value {
+    let mut demo = Started::new("demo", &program("demo"))
+        .args(["--scenario", scenario, "--speed", speed, "--json"])
+        .start();
+    let ended = demo.wait_for_end(Duration::from_secs(170));
+    let report = demo.json_lines().pop().unwrap_or_default();
+    assert!(ended.success(), "{report} {demo}");
+    assert_eq!(report["finished"], true, "{report}");
+    report
+}
+
+#[test]
+fn a_fuse_that_hits_the_box_is_inserted_by_a_second_try_of_arms_of_two_makes() {
+    let Some(_cell) = Cell::with(&[]) else { return };
+    let report = told("fuses", "4");
+    let insertions = report["insertions"].as_array().unwrap();
+    let arms: Vec<&Value> = insertions.iter().map(|of| &of["arm"]).collect();
+    assert_eq!(arms, ["ur5", "fuse-arm"], "{report}");
+    for insertion in insertions {
+        let counts = ["tries", "resisted"].map(|of| insertion[of].as_u64());
+        assert_eq!(counts, [Some(2), Some(1)], "{insertion}");
+        assert_eq!(insertion["released"], true, "{insertion}");
+        let far = insertion["from_seat_mm"].as_f64().unwrap();
+        assert!(far.abs() < 1.0, "{insertion}");
+        let steps = insertion["steps"].as_array().unwrap();
+        let steps: Vec<&str> = steps.iter().filter_map(|of| of["step"].as_str()).collect();
+        let expected = [
+            "over the magazine",
+            "down to the fuse",
+            "grip",
+            "lift",
+            "over the slot",
+            "insert",
+            "back off",
+            "shift",
+            "insert again",
+            "release",
+            "away",
+        ];
+        assert_eq!(steps, expected);
+    }
+}
+
+#[test]
+fn terminal_blocks_come_onto_the_rail_by_a_gripper_that_the_robot_takes_and_puts_away() {
+    let Some(_cell) = Cell::with(&[]) else { return };
+    let report = told("terminals", "16");
+    let steps = report["steps"].as_array().unwrap();
+    let ran: Vec<(&str, &str)> = steps
+        .iter()
+        .map(|step| {
+            let text = |key: &str| step[key].as_str().unwrap();
+            (text("step"), text("component"))
+        })
+        .collect();
+    let (changer, handling) = ("urn:example:tool-changer", "urn:example:handling");
+    let expected = [
+        ("take the gripper", changer),
+        ("first block", handling),
+        ("second block", handling),
+        ("third block", handling),
+        ("put the gripper away", changer),
+    ];
+    assert_eq!(ran, expected, "{report}");
+    // The simulated robot was with its fingers at each block and at its place on the rail.
+    let visits = report["visits"].as_array().unwrap();
+    assert_eq!(visits.len(), 6, "{report}");
+    let nearest = visits
+        .iter()
+        .map(|visit| visit["nearest_mm"].as_f64().unwrap());
+    assert!(nearest.into_iter().all(|mm| mm <= 0.1), "{report}");
+}

@@ -2,30 +2,18 @@
 
 use std::fmt::Write as _;
 
-use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value};
+use serde::Serialize;
+
+use crate::stage::StepRun;
 
 /// The report.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Report {
-    pub(super) finished: bool,
-    pub(super) failure: Option<String>,
     pub(super) speed: f64,
     /// Time from the start of the programs until each step had a skill.
     pub(super) planned_ms: Option<f64>,
     /// The runs of skills, in the order in which they began.
     pub(super) steps: Vec<StepRun>,
-}
-
-/// A run of a skill, as `ua-mes` records it. Times are in ms since 1970.
-#[derive(Clone, Debug, Deserialize, Serialize)]
-pub(super) struct StepRun {
-    pub(super) step: String,
-    pub(super) component: String,
-    pub(super) parameters: Map<String, Value>,
-    pub(super) started_ms: u64,
-    pub(super) ended_ms: Option<u64>,
-    pub(super) outcome: String,
 }
 
 impl Report {
@@ -65,12 +53,9 @@ mod tests {
     #[test]
     fn steps_overlap_if_one_begins_before_another_has_ended() {
         let step = |started_ms, ended_ms| StepRun {
-            step: String::new(),
-            component: String::new(),
-            parameters: Map::new(),
             started_ms,
             ended_ms,
-            outcome: "done".to_owned(),
+            ..StepRun::default()
         };
         let report = |steps| Report {
             steps,

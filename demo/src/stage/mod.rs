@@ -5,8 +5,11 @@ mod browser;
 mod failure;
 mod hops;
 mod interrupt;
+mod mes;
+mod mes_cell;
 mod pages;
 mod programs;
+mod show;
 mod stop;
 mod timeline;
 
@@ -15,9 +18,12 @@ pub(crate) use browser::{address, open_when_served, status_of};
 pub(crate) use failure::Failure;
 pub(crate) use hops::{Hop, Hops, delays, micros};
 pub(crate) use interrupt::Interrupt;
+pub(crate) use mes::{MES_WHO, StepRun};
+pub(crate) use mes_cell::MesCell;
 pub(crate) use pages::fetch;
 pub(crate) use programs::{Program, Programs, Report, Stage, command};
-pub(crate) use stop::{Stop, unexpected};
+pub(crate) use show::Show;
+pub(crate) use stop::{Stop, watched};
 pub(crate) use timeline::{Timeline, Who};
 
 /// The interface of the PubSub group, by address, because its name differs between systems.

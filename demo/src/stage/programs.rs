@@ -159,6 +159,26 @@ impl Programs {
         Ok(started)
     }
 
+    /// Starts a program that prints no events and reads no input.
+    pub(crate) fn launch(
+        &mut self,
+        name: &'static str,
+        path: PathBuf,
+        arguments: &[&str],
+        stage: Stage,
+    ) -> Result<(), Failure> {
+        let program = Program {
+            name,
+            path,
+            arguments: arguments.iter().map(|&text| text.to_owned()).collect(),
+            environment: Vec::new(),
+            tells: false,
+            hears: false,
+            stage,
+        };
+        self.start(program).map(drop)
+    }
+
     /// Sends SIGKILL to a program, as in a power failure. [`Report::Killed`] contains the time.
     /// Does nothing if the program has ended.
     pub(crate) fn kill(&self, name: &str) {

@@ -5,6 +5,7 @@ use std::process::ExitStatus;
 use tokio::sync::mpsc;
 
 use super::failure::Failure;
+use super::interrupt::Interrupt;
 use super::programs::{Programs, Report};
 
 /// The reason why a scenario stops.
@@ -44,8 +45,24 @@ impl Stop {
     }
 }
 
+/// Plays a scenario until it ends, a program ends unexpectedly, or a signal stops it.
+pub(crate) async fn watched(
+    played: impl Future<Output = Result<(), Stop>>,
+    reports: &mut mpsc::Receiver<Report>,
+) -> Result<(), Stop> {
+    let mut interrupt = Interrupt::listen()?;
+    let ended = tokio::select! {
+        played = played => played,
+        (name, status) = unexpected(reports) => Err(Stop::Ended(name, status)),
+        () = interrupt.come() => Err(Stop::Interrupted),
+    };
+    // No reports are read after this point, and no process may block on sending them.
+    reports.close();
+    ended
+}
+
 /// Returns the first program that ends unexpectedly.
-pub(crate) async fn unexpected(reports: &mut mpsc::Receiver<Report>) -> (&'static str, ExitStatus) {
+async fn unexpected(reports: &mut mpsc::Receiver<Report>) -> (&'static str, ExitStatus) {
     loop {
         match reports.recv().await {
             Some(Report::Ended { name, status }) => return (name, status),

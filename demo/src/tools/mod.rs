@@ -26,11 +26,10 @@ use tokio::time::{Instant, sleep, timeout};
 
 use self::cell::{CHANGER, DEVICE_PORTS, FINGERS, HANDLING, PARTS, Part, VACUUM};
 use self::report::{Report, Run};
-use crate::clock::{millis, wall_nanos};
 use crate::pace::Speed;
 use crate::stage::{
-    Failure, Interrupt, LOOPBACK, Program, Programs, Stage, Stop, Timeline, Who, address, fetch,
-    find, free_port, must_be_free, open_when_served, unexpected,
+    Failure, LOOPBACK, Programs, Show, Stage, Stop, Who, address, fetch, find, free_port,
+    must_be_free, open_when_served, watched,
 };
 
 /// The options of the scenario.
@@ -46,63 +45,18 @@ pub(crate) struct Plan {
 
 /// Plays the scenario and prints it. Returns the exit code.
 pub(crate) async fn play(plan: Plan) -> u8 {
-    let mut show = Show {
-        timeline: Timeline::open(plan.json),
-        report: Report {
-            speed: plan.speed.factor(),
-            swapped: plan.swapped,
-            ..Report::default()
-        },
-        began_at: wall_nanos(),
+    let mut show = Show::open(plan.json);
+    let mut report = Report {
+        speed: plan.speed.factor(),
+        swapped: plan.swapped,
+        ..Report::default()
     };
-    let outcome = perform(&plan, &mut show).await;
-    show.report.finished = outcome.is_ok();
-    show.report.failure = outcome.as_ref().err().map(ToString::to_string);
-    let printed = show.conclude(plan.json);
-    match (outcome, printed) {
-        (Err(failure), _) => failure.exit_code(),
-        // Standard output is closed, for example by `| head`.
-        (Ok(()), Err(_)) => 74,
-        (Ok(()), Ok(())) => 0,
-    }
+    let outcome = perform(&plan, &mut show, &mut report).await;
+    show.conclude(&outcome, &report, &report.table())
 }
 
-/// The printed output.
-struct Show {
-    timeline: Timeline,
-    report: Report,
-    began_at: i64,
-}
-
-impl Show {
-    fn note(&mut self, who: Who, what: String) -> Result<(), Failure> {
-        let now = wall_nanos();
-        self.timeline.note(now, who, what);
-        let began_at = self.began_at;
-        let seconds = |at_ns: i64| Some(millis(at_ns - began_at) / 1e3);
-        let printed = self.timeline.print_all(&seconds);
-        printed.map_err(Failure::io("cannot print"))
-    }
-
-    fn conclude(&mut self, json: bool) -> std::io::Result<()> {
-        self.timeline.print_text(&self.report.table())?;
-        if let Some(failure) = &self.report.failure {
-            self.timeline.print_text(&format!("error: {failure}\n"))?;
-        }
-        if json {
-            use std::io::Write as _;
-            let mut out = std::io::stdout().lock();
-            serde_json::to_writer(&mut out, &self.report)?;
-            out.write_all(b"\n")?;
-            out.flush()?;
-        }
-        Ok(())
-    }
-}
-
-async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
+async fn perform(plan: &Plan, show: &mut Show, report: &mut Report) -> Result<(), Failure> {
     let (_, [lds, component, tool]) = find(["ua-lds", "ua-component", "ua-space"])?;
-    let mut interrupt = Interrupt::listen()?;
     must_be_free(LDS_PORT, "discovery server")?;
     let ports = PARTS.iter().filter_map(|part| part.port);
     for port in ports.chain(DEVICE_PORTS) {
@@ -119,13 +73,9 @@ async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
         page: free_port()?,
         browser: free_port()?,
         show,
+        report,
     };
-    let played = tokio::select! {
-        played = story.play() => played,
-        (name, status) = unexpected(&mut reports) => Err(Stop::Ended(name, status)),
-        () = interrupt.come() => Err(Stop::Interrupted),
-    };
-    reports.close();
+    let played = watched(story.play(), &mut reports).await;
     let outcome = played.map_err(|stop| story.failure(stop));
     story.programs.conclude(outcome).await
 }
@@ -141,6 +91,7 @@ struct Story<'a> {
     /// The port of the page of the cell.
     browser: u16,
     show: &'a mut Show,
+    report: &'a mut Report,
 }
 
 impl Story<'_> {
@@ -157,14 +108,13 @@ impl Story<'_> {
             address(self.browser),
             self.programs.directory().display()
         );
-        let printed = self.show.timeline.print_text(&text);
-        printed.map_err(Failure::io("cannot print"))?;
+        self.show.text(&text)?;
         self.start_all().await?;
         let began = Instant::now();
         for part in &PARTS {
             self.found(part, began).await?;
         }
-        self.show.report.found_ms = Some(elapsed(began));
+        self.report.found_ms = Some(elapsed(began));
         self.count_robots().await?;
 
         self.change(FINGERS).await?;
@@ -190,18 +140,18 @@ impl Story<'_> {
         let store = cell::store(&directory, cell::LDS).display().to_string();
         let secured = ["--pki", &store, "--secured-only"];
         let arguments = ["--endpoint", &endpoint, "--metrics", &metrics];
-        let arguments: Vec<String> = arguments
-            .into_iter()
-            .chain(secured)
-            .map(str::to_owned)
-            .collect();
-        self.start(cell::LDS, self.lds.clone(), arguments, Stage::Bridges)?;
+        let arguments = [&arguments[..], &secured].concat();
+        self.programs
+            .launch(cell::LDS, self.lds.clone(), &arguments, Stage::Bridges)?;
         let metrics = format!("{LOOPBACK}:{}", self.browser);
-        let arguments = ["page", "--interface", LOOPBACK, "--metrics", &metrics].map(str::to_owned);
-        self.start("page", self.tool.clone(), arguments.into(), Stage::Bridges)?;
+        let arguments = ["page", "--interface", LOOPBACK, "--metrics", &metrics];
+        self.programs
+            .launch("page", self.tool.clone(), &arguments, Stage::Bridges)?;
         open_when_served(self.browser, self.plan.open);
         for (name, arguments) in cell::simulators(self.plan.speed) {
-            self.start(name, self.component.clone(), arguments, Stage::Master)?;
+            let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+            self.programs
+                .launch(name, self.component.clone(), &arguments, Stage::Master)?;
         }
         let began = Instant::now();
         while !cell::trust_discovery(&directory)
@@ -223,33 +173,11 @@ impl Story<'_> {
         let directory = self.programs.directory();
         let yaml = directory.join(format!("{name}.yaml")).display().to_string();
         let store = cell::store(directory, name).display().to_string();
-        let arguments = [&yaml, "--interface", LOOPBACK, "--pki", &store].map(str::to_owned);
-        self.start(
-            name,
-            self.component.clone(),
-            arguments.into(),
-            Stage::Components,
-        )?;
+        let arguments = [&yaml, "--interface", LOOPBACK, "--pki", &store];
+        let component = self.component.clone();
+        self.programs
+            .launch(name, component, &arguments, Stage::Components)?;
         self.show.note(Who(name, "36"), "is plugged in".to_owned())
-    }
-
-    fn start(
-        &mut self,
-        name: &'static str,
-        path: PathBuf,
-        arguments: Vec<String>,
-        stage: Stage,
-    ) -> Result<(), Failure> {
-        self.programs.start(Program {
-            name,
-            path,
-            arguments,
-            environment: Vec::new(),
-            tells: false,
-            hears: false,
-            stage,
-        })?;
-        Ok(())
     }
 
     /// Waits until a component is registered, and its skills are available if its port is known.
@@ -294,7 +222,7 @@ impl Story<'_> {
             .map_err(|error| Stop::Broken(format!("ua-lds does not tell who is there: {error}")))?;
         let servers = page.get("servers").and_then(Json::as_array);
         let robots = ["urn:example:ur5", "urn:example:robot"];
-        self.show.report.robots = servers
+        self.report.robots = servers
             .into_iter()
             .flatten()
             .filter_map(|server| server.get("uri")?.as_str())
@@ -357,7 +285,7 @@ impl Story<'_> {
                 "the run was over before the gripper was killed".to_owned(),
             ));
         };
-        self.show.report.told_lost_ms = Some(elapsed(killed));
+        self.report.told_lost_ms = Some(elapsed(killed));
         if run.succeeded
             || !run.message.contains("is lost")
             || !run.message.contains("has retreated")
@@ -373,7 +301,7 @@ impl Story<'_> {
         if let Some(part) = part {
             self.found(part, again).await?;
         }
-        self.show.report.found_again_ms = Some(elapsed(again));
+        self.report.found_again_ms = Some(elapsed(again));
         Ok(())
     }
 
@@ -425,7 +353,7 @@ impl Story<'_> {
         };
         self.show
             .note(Who(component, "36"), format!("{skill}: {ended}"))?;
-        self.show.report.runs.push(run.clone());
+        self.report.runs.push(run.clone());
         Ok(run)
     }
 
@@ -450,7 +378,7 @@ impl Story<'_> {
 
     fn failure(&self, stop: Stop) -> Failure {
         stop.failure(&self.programs, || {
-            format!("{} runs were over", self.show.report.runs.len())
+            format!("{} runs were over", self.report.runs.len())
         })
     }
 }

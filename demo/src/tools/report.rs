@@ -7,8 +7,6 @@ use serde::Serialize;
 /// The report.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct Report {
-    pub(super) finished: bool,
-    pub(super) failure: Option<String>,
     pub(super) speed: f64,
     pub(super) swapped: bool,
     /// Number of robots in the cell.

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::Parser as _;
 use devices::{Faults, Line, Registers, Serving, kelvin, robotiq, schmalz, ur};
+use skills::simulated::Hole;
 use tokio::process::{Child, Command};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::task::JoinSet;
@@ -67,6 +68,9 @@ enum Device {
         /// The height of a surface that pushes the tool back, m
         #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
         surface: Option<f64>,
+        /// A hole in that surface: x, y and its radius, m
+        #[arg(long, value_name = "X,Y,RADIUS", requires = "surface", allow_hyphen_values = true, value_parser = hole)]
+        hole: Option<Hole>,
         #[command(flatten)]
         pace: Pace,
     },
@@ -202,6 +206,19 @@ fn report(line: &str) {
 /// Interval of the checks of the supply of tools.
 const SUPPLY_LOOK: Duration = Duration::from_millis(10);
 
+fn hole(text: &str) -> Result<Hole, &'static str> {
+    let read = numbers(text).map(Hole::new);
+    let read = read.filter(|hole| hole.radius > 0.0);
+    read.ok_or("three numbers with commas, the last above 0")
+}
+
+/// Returns numbers with commas between them, each from -10 to 10.
+fn numbers<const N: usize>(text: &str) -> Option<[f64; N]> {
+    let numbers = text.split(',').map(|part| within(part, -10.0, 10.0));
+    let numbers: Vec<f64> = numbers.collect::<Option<_>>()?;
+    numbers.try_into().ok()
+}
+
 fn docked(text: &str) -> Result<kelvin::simulator::Docked, &'static str> {
     let read = || {
         let (number, dock) = text.split_once('@')?;
@@ -209,11 +226,7 @@ fn docked(text: &str) -> Result<kelvin::simulator::Docked, &'static str> {
             .parse()
             .ok()
             .filter(|number| (1..=10).contains(number))?;
-        let dock: Vec<f64> = dock
-            .split(',')
-            .map(|part| within(part, -10.0, 10.0))
-            .collect::<Option<_>>()?;
-        let dock = dock.try_into().ok()?;
+        let dock = numbers(dock)?;
         Some(kelvin::simulator::Docked { number, dock })
     };
     read().ok_or("a number from 1 to 10, @, and six numbers with commas")
@@ -282,11 +295,13 @@ async fn simulated(device: Device) -> io::Result<()> {
             rtde,
             secondary,
             surface,
+            hole,
             pace,
         } => {
             let settings = ur::simulator::Settings {
                 time_scale: pace.speed,
                 surface,
+                hole,
                 ..ur::simulator::Settings::default()
             };
             let simulator = ur::simulator::Simulator::new(settings);
@@ -352,6 +367,14 @@ mod tests {
     fn the_arguments_are_as_clap_wants_them() {
         use clap::CommandFactory as _;
         Simulate::command().debug_assert();
+    }
+
+    #[test]
+    fn a_hole_is_read() {
+        assert_eq!(hole("0.4,-0.15,0.002"), Ok(Hole::new([0.4, -0.15, 0.002])));
+        for wrong in ["", "0.4,0.1", "0.4,0.1,0", "0.4,0.1,0.1,0.1"] {
+            assert!(hole(wrong).is_err(), "{wrong}");
+        }
     }
 
     #[test]

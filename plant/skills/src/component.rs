@@ -221,6 +221,8 @@ pub struct Simulation {
     pub time_scale: Option<f64>,
     /// Height of the tool below which a contact force acts, m.
     pub contact: Option<f64>,
+    /// A hole in the surface at that height: x, y and radius, m.
+    pub hole: Option<[f64; 3]>,
 }
 
 /// The servers of the skills that a composite runs.

@@ -6,7 +6,7 @@ mod changer;
 mod gripper;
 mod profile;
 
-pub use arm::{Arm, ArmSettings, Path};
+pub use arm::{Arm, ArmSettings, Hole, Path};
 pub use base::Base;
 pub use changer::{Change, Changer};
 pub use gripper::{Gripper, GripperSettings};

@@ -14,6 +14,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 pub use served::Serving;
+use skills::simulated::Hole;
 use tokio::time::Instant;
 
 use self::motion::Motion;
@@ -29,6 +30,8 @@ pub struct Settings {
     pub home: [f64; 6],
     /// The height of a surface that pushes the tool back, m; `None` for none.
     pub surface: Option<f64>,
+    /// A hole in that surface.
+    pub hole: Option<Hole>,
 }
 
 impl Default for Settings {
@@ -37,6 +40,7 @@ impl Default for Settings {
             time_scale: 1.0,
             home: [0.4, 0.0, 0.5, 0.0, 0.0, 0.0],
             surface: None,
+            hole: None,
         }
     }
 }
@@ -169,8 +173,10 @@ impl Robot {
 
     /// Returns the force at the tool: that of the surface, N.
     fn force(&self) -> [f64; 6] {
-        let [_, _, z, ..] = self.pose;
-        let depth = self.settings.surface.map_or(0.0, |surface| surface - z);
+        let [x, y, z, ..] = self.pose;
+        let is_over_hole = self.settings.hole.is_some_and(|hole| hole.admits(x, y));
+        let surface = self.settings.surface.filter(|_| !is_over_hole);
+        let depth = surface.map_or(0.0, |surface| surface - z);
         [0.0, 0.0, depth.max(0.0) * STIFFNESS, 0.0, 0.0, 0.0]
     }
 

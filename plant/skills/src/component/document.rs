@@ -675,14 +675,22 @@ pub(super) fn read_command(node: &Node, reader: &mut Reader<'_>) -> Option<Vec<S
 }
 
 fn read_simulation(node: &Node, reader: &mut Reader<'_>) -> Option<Simulation> {
-    let keys = ["duration", "object", "reach", "time_scale", "contact"];
-    let [duration, object, reach, time_scale, contact] = reader.map(node, keys)?;
+    let keys = [
+        "duration",
+        "object",
+        "reach",
+        "time_scale",
+        "contact",
+        "hole",
+    ];
+    let [duration, object, reach, time_scale, contact, hole] = reader.map(node, keys)?;
     Some(Simulation {
         duration: duration.and_then(|node| reader.duration(node)),
         object: object.and_then(|node| reader.boolean(node)),
         reach: reach.and_then(|node| reader.number(node, (0.01, 100.0))),
         time_scale: time_scale.and_then(|node| reader.number(node, (0.01, 1000.0))),
         contact: contact.and_then(|node| reader.number(node, (-100.0, 100.0))),
+        hole: hole.and_then(|node| read_numbers(node, (-100.0, 100.0), reader)),
     })
 }
 

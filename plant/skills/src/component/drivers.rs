@@ -8,7 +8,9 @@ use crate::client::{PeerAccess, Remote};
 use crate::driver::Driver;
 use crate::model::NAMESPACE;
 use crate::parameters::TypeName;
-use crate::simulated::{Arm, ArmSettings, Base, Change, Changer, Gripper, GripperSettings, Path};
+use crate::simulated::{
+    Arm, ArmSettings, Base, Change, Changer, Gripper, GripperSettings, Hole, Path,
+};
 use crate::workspace::Workspace;
 
 /// Creates the drivers of a component. Its skills share a gripper, a robot, a tool changer and a
@@ -143,6 +145,7 @@ impl Drivers {
             reach: how.reach.unwrap_or(usual.reach),
             time_scale: how.time_scale.unwrap_or(usual.time_scale),
             contact: how.contact,
+            hole: how.hole.map(Hole::new),
             ..usual
         };
         let arm = self.arm.get_or_insert_with(|| Arm::new(settings.clone()));

@@ -24,6 +24,34 @@ pub struct ArmSettings {
     pub turning: f64,
     /// Height of the tool below which a contact force acts, m.
     pub contact: Option<f64>,
+    /// A hole in the surface at that height, without a force.
+    pub hole: Option<Hole>,
+}
+
+/// A round hole in the surface below a tool, as that of a slot for a part. In m, in the frame of the
+/// base of the robot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hole {
+    /// x of the centre.
+    pub x: f64,
+    /// y of the centre.
+    pub y: f64,
+    /// Largest distance of the tool from the centre.
+    pub radius: f64,
+}
+
+impl Hole {
+    /// Creates a hole from x, y and the radius.
+    #[must_use]
+    pub const fn new([x, y, radius]: [f64; 3]) -> Self {
+        Self { x, y, radius }
+    }
+
+    /// Returns whether a tool at this place fits into the hole.
+    #[must_use]
+    pub fn admits(&self, x: f64, y: f64) -> bool {
+        (x - self.x).hypot(y - self.y) <= self.radius
+    }
 }
 
 impl Default for ArmSettings {
@@ -34,6 +62,7 @@ impl Default for ArmSettings {
             home: [0.4, 0.0, 0.5, 0.0, 0.0, 0.0],
             turning: 3.0,
             contact: None,
+            hole: None,
         }
     }
 }
@@ -160,7 +189,9 @@ impl Driver for Motion {
             *lock(&self.arm.position) = between(from, target, share);
             #[expect(clippy::cast_possible_truncation, reason = "a share for people to see")]
             work.progress(share as f32);
-            let touched = touches.is_some_and(|height| self.arm.position()[2] < height);
+            let [x, y, z, ..] = self.arm.position();
+            let is_over_hole = self.arm.settings.hole.is_some_and(|hole| hole.admits(x, y));
+            let touched = touches.is_some_and(|height| z < height && !is_over_hole);
             if touched || seconds >= profile.seconds() {
                 break touched;
             }
@@ -436,5 +467,25 @@ mod tests {
         assert_eq!(moved.results[1], ("ForceExceeded".to_owned(), true.into()));
         let [_, _, z, ..] = arm.position();
         assert!(z < 0.3 && z > 0.1, "{z}");
+    }
+
+    #[tokio::test]
+    async fn a_yielding_move_goes_through_a_hole_and_stops_beside_it() {
+        for (x, is_through) in [(0.4, true), (0.41, false)] {
+            let arm = Arm::new(ArmSettings {
+                time_scale: 20.0,
+                contact: Some(0.3),
+                hole: Some(Hole::new([0.4, 0.0, 0.002])),
+                home: [x, 0.0, 0.5, 0.0, 0.0, 0.0],
+                ..ArmSettings::default()
+            });
+            let target = [x, 0.0, 0.2, 0.0, 0.0, 0.0];
+            let moved = conformance::run_once("ForceMoveSkillType", arm.yields(), pushing(target))
+                .await
+                .unwrap();
+            let blocked = ("ForceExceeded".to_owned(), (!is_through).into());
+            assert_eq!(moved.results[1], blocked, "at {x} m");
+            assert_eq!(arm.position() == target, is_through, "at {x} m");
+        }
     }
 }

@@ -1,0 +1,134 @@
+//! A cell whose MES runs processes: discovery server, MES, components and simulated devices.
+
+use std::fs;
+use std::path::PathBuf;
+
+use tokio::sync::mpsc;
+
+use super::mes::Mes;
+use super::{Failure, LOOPBACK, Programs, Report, Show, Stage, Who, find, free_port, must_be_free};
+use crate::pace::Speed;
+
+/// The programs of a cell whose MES runs processes.
+pub(crate) struct MesCell {
+    pub(crate) programs: Programs,
+    pub(crate) mes: Mes,
+    binaries: Binaries,
+    /// The port at which the MES answers.
+    questions: u16,
+}
+
+struct Binaries {
+    lds: PathBuf,
+    component: PathBuf,
+    mes: PathBuf,
+    tool: PathBuf,
+}
+
+impl MesCell {
+    /// Checks that the programs exist and that their ports are free. Returns the cell, and the
+    /// receiver of the reports.
+    pub(crate) fn prepare(
+        ports: &[u16],
+        show: &mut Show,
+        title: &str,
+        speed: Speed,
+    ) -> Result<(Self, mpsc::Receiver<Report>), Failure> {
+        let (_, [lds, component, mes, tool]) =
+            find(["ua-lds", "ua-component", "ua-mes", "ua-space"])?;
+        must_be_free(LDS_PORT, "discovery server")?;
+        for port in ports {
+            must_be_free(*port, "component or simulator")?;
+        }
+        let prepared = Programs::prepare();
+        let (programs, reports) =
+            prepared.map_err(Failure::io("cannot make a directory for the logs"))?;
+        show.text(&format!(
+            "{title}; speed {}.\nTimes are seconds since the beginning; the logs are in {}.\n\n",
+            speed.factor(),
+            programs.directory().display()
+        ))?;
+        let questions = free_port()?;
+        let cell = Self {
+            programs,
+            mes: Mes::new(tool.clone(), questions),
+            binaries: Binaries {
+                lds,
+                component,
+                mes,
+                tool,
+            },
+            questions,
+        };
+        Ok((cell, reports))
+    }
+
+    /// Writes an input file of a program.
+    pub(crate) fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
+        let written = fs::write(self.programs.directory().join(name), text);
+        written.map_err(Failure::io("cannot write the files of the programs"))
+    }
+
+    /// Starts the discovery server, and the MES of a file.
+    pub(crate) fn start_mes(&mut self, file: &str) -> Result<(), Failure> {
+        let endpoint = format!("opc.tcp://{LOOPBACK}:{LDS_PORT}");
+        let lds = self.binaries.lds.clone();
+        let arguments = ["--endpoint", &endpoint];
+        self.programs
+            .launch("ua-lds", lds, &arguments, Stage::Bridges)?;
+        let sparql = format!("{LOOPBACK}:{}", self.questions);
+        let yaml = self.path(file);
+        let arguments = [&yaml, "--interface", LOOPBACK, "--sparql", &sparql];
+        let mes = self.binaries.mes.clone();
+        self.programs
+            .launch("ua-mes", mes, &arguments, Stage::Bridges)
+    }
+
+    /// Starts a simulated device of `ua-component`.
+    pub(crate) fn simulate(
+        &mut self,
+        name: &'static str,
+        arguments: &[&str],
+    ) -> Result<(), Failure> {
+        let arguments = [&["simulate"], arguments].concat();
+        let component = self.binaries.component.clone();
+        self.programs
+            .launch(name, component, &arguments, Stage::Master)
+    }
+
+    /// Starts a simulated process module of `ua-space`.
+    pub(crate) fn simulate_module(
+        &mut self,
+        name: &'static str,
+        manifest: &str,
+        arguments: &[&str],
+    ) -> Result<(), Failure> {
+        let manifest = self.path(manifest);
+        let arguments = [&["pea", &manifest], arguments].concat();
+        let tool = self.binaries.tool.clone();
+        self.programs.launch(name, tool, &arguments, Stage::Master)
+    }
+
+    /// Starts the component of a file `NAME.yaml`.
+    pub(crate) fn plug_in(&mut self, name: &'static str, show: &mut Show) -> Result<(), Failure> {
+        let yaml = self.path(&format!("{name}.yaml"));
+        let arguments = [&yaml, "--interface", LOOPBACK];
+        let component = self.binaries.component.clone();
+        self.programs
+            .launch(name, component, &arguments, Stage::Components)?;
+        show.note(Who(name, "36"), "is plugged in".to_owned())
+    }
+
+    /// Kills a component, as in a power failure.
+    pub(crate) fn unplug(&self, name: &'static str, show: &mut Show) -> Result<(), Failure> {
+        self.programs.kill(name);
+        show.note(Who(name, "31"), "is unplugged".to_owned())
+    }
+
+    fn path(&self, file: &str) -> String {
+        let path = self.programs.directory().join(file);
+        path.display().to_string()
+    }
+}
+
+const LDS_PORT: u16 = 4840;
