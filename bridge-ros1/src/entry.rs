@@ -4,16 +4,16 @@ use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
 
 use bridge_core::Local;
 use bridge_node::{
-    Arguments, Carried, Context, Failure, FailureKind, KeyService, Program, Rank,
-    RedundancyArguments, SharedProgram,
+    Arguments, Carried, Context, Failure, FailureKind, Program, Rank, RedundancyArguments,
+    SharedProgram,
 };
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser};
 use mappings::{Mapping, SpaceId};
 use mdns::{Bridge, TellingArguments, tell_bridge};
+#[cfg(feature = "sks")]
 use plant_keys::KeyArguments;
 use tcpros::{ArgumentError, NodeError, NodeOptions};
 use tracing::warn;
@@ -54,6 +54,7 @@ struct BridgeRos1 {
 struct Flags {
     #[command(flatten)]
     arguments: Arguments,
+    #[cfg(feature = "sks")]
     #[command(flatten)]
     keys: KeyArguments,
     #[command(flatten)]
@@ -125,6 +126,7 @@ impl Program for BridgeRos1 {
 
     const NAME: &'static str = "bridge-ros1";
     // Keys are fetched over OPC UA; the result is logged by this program.
+    #[cfg(feature = "sks")]
     const QUIET: &'static str = plant_keys::QUIET;
     const LOCAL: Local = Local::Ros1;
 
@@ -144,7 +146,11 @@ impl Program for BridgeRos1 {
         self.flags.redundancy.rank
     }
 
-    fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
+    #[cfg(feature = "sks")]
+    fn key_service(
+        &self,
+        _mapping: &Mapping,
+    ) -> Option<std::sync::Arc<dyn bridge_node::KeyService>> {
         Some(self.flags.keys.service(Self::NAME))
     }
 

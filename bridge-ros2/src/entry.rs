@@ -7,16 +7,17 @@ use std::net::{IpAddr, SocketAddr};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::{Arc, LazyLock};
+use std::sync::LazyLock;
 
 use bridge_core::Local;
 use bridge_node::{
-    Arguments, Carried, Context, Failure, FailureKind, KeyService, Program, Rank,
-    RedundancyArguments, SharedProgram,
+    Arguments, Carried, Context, Failure, FailureKind, Program, Rank, RedundancyArguments,
+    SharedProgram,
 };
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
 use mdns::{Bridge, TellingArguments, tell_bridge};
+#[cfg(feature = "sks")]
 use plant_keys::KeyArguments;
 use ros2_node::discovery_info::GidLength;
 use ros2_node::domain::{DiscoveryRange, DomainError, DomainOptions};
@@ -51,6 +52,7 @@ pub fn shared(arguments: Vec<OsString>) -> Result<SharedProgram, ExitCode> {
 struct BridgeRos2 {
     #[command(flatten)]
     arguments: Arguments,
+    #[cfg(feature = "sks")]
     #[command(flatten)]
     keys: KeyArguments,
     #[command(flatten)]
@@ -253,6 +255,7 @@ impl Program for BridgeRos2 {
 
     const NAME: &'static str = NAME;
     // Keys are fetched over OPC UA, and this program logs the outcome.
+    #[cfg(feature = "sks")]
     const QUIET: &'static str = plant_keys::QUIET;
     const LOCAL: Local = Local::Cdr;
 
@@ -277,7 +280,11 @@ impl Program for BridgeRos2 {
         self.redundancy.rank
     }
 
-    fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
+    #[cfg(feature = "sks")]
+    fn key_service(
+        &self,
+        _mapping: &Mapping,
+    ) -> Option<std::sync::Arc<dyn bridge_node::KeyService>> {
         Some(self.keys.service(Self::NAME))
     }
 

@@ -113,7 +113,7 @@ impl KeyRing {
                     (Some(KeySource::Own(_) | KeySource::Sks(_)), None) => warn!(
                         group = group.id,
                         "this program cannot fetch keys from a Security Key Service: it sends and receives \
-                         nothing in the group; use a key file for the group"
+                         nothing in the group; use a key file for the group, or the bridge of `ua-bridge`"
                     ),
                     (Some(KeySource::File(_) | KeySource::Credential(_)) | None, _) => {
                         drop(tokio::spawn(watch_file(group.clone(), (out, wants))));
