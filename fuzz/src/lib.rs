@@ -17,7 +17,6 @@ mod mapping;
 mod mdns;
 mod message;
 mod nodeset;
-mod reader_state;
 mod registry;
 mod secured;
 #[path = "../../ros/messages/tests/support/mod.rs"]
@@ -36,7 +35,6 @@ pub use mapping::mapping;
 pub use mdns::mdns;
 pub use message::message;
 pub use nodeset::nodeset;
-pub use reader_state::reader_state;
 pub use secured::secured;
 
 /// A function that panics if the tested code violates a guarantee on the input.
@@ -56,7 +54,6 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("mdns", mdns),
     ("message", message),
     ("nodeset", nodeset),
-    ("reader_state", reader_state),
     ("registry", registry),
     ("secured", secured),
 ];

@@ -14,7 +14,7 @@
 //! | probes and announcements, DataSetMetaData | [`discovery`] |
 //! | requests and responses of Actions | [`action`] |
 //! | calls over a network that loses messages | [`action::Requestor`], [`action::Responder`] |
-//! | sequence numbers, timeouts and states | [`DataSetReaderState`], [`ReaderTable`], [`DataSetWriterState`] |
+//! | sequence numbers | [`SequenceOrder`] |
 //!
 //! Variants of the unassigned builtin types 26 to 31 are decoded as ByteStrings (OPC 10000-6,
 //! 5.2.2.16). Chunks with an ActionHeader are [`DecodeError::Unsupported`].
@@ -85,8 +85,6 @@ mod node_id;
 mod publisher_id;
 mod raw;
 mod reader;
-mod reader_state;
-mod reader_table;
 mod reassembler;
 mod scalar;
 mod security;
@@ -96,7 +94,6 @@ mod structure;
 mod time;
 mod variant;
 mod writer;
-mod writer_state;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
 pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
@@ -119,10 +116,6 @@ pub use raw::{
     RawLayoutFault, RawMembers, RawStructure, RawStructureType, RawValue, RawWriteError,
     RawWriteFault,
 };
-pub use reader_state::{
-    Accepted, Arrival, DataSetReaderState, ReaderCounters, ReaderDrop, ReaderSettings,
-};
-pub use reader_table::{ReaderKey, ReaderTable};
 pub use reassembler::{
     ChunkRefusal, GiveUp, GivenUp, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
 };
@@ -131,12 +124,11 @@ pub use security::{
     CountedBy, KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer,
     SecurityError, SecurityMode, SecurityPolicy,
 };
-pub use sequence::{SequenceCounter, SequenceOrder};
-pub use state::{PubSubState, StateEvent, StateMachine, StateRefused};
+pub use sequence::SequenceOrder;
+pub use state::PubSubState;
 pub use structure::StructureReader;
 pub use time::{DateTime, Timestamp};
 pub use variant::{Array, Elements, Matrix, Variant};
-pub use writer_state::{DataSetWriterState, WriterSettings, WriterSettingsError};
 
 /// Runs the example of the README.
 #[cfg(doctest)]

@@ -1,4 +1,4 @@
-//! Tests of the codec and its states, as a single program so that they are linked once.
+//! Tests of the codec, as a single program so that they are linked once.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::indexing_slicing,
@@ -18,6 +18,7 @@ mod rewrite;
 mod action;
 mod allocation;
 mod chunks;
+mod delta;
 mod discovery;
 mod hostile;
 mod properties;
@@ -25,6 +26,5 @@ mod raw;
 mod raw_properties;
 mod reading;
 mod security;
-mod state;
 mod vectors;
 mod writing;
