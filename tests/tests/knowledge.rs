@@ -1,7 +1,7 @@
 //! The knowledge graph of the plant, compared with rdflib: the same queries on the same statements
 //! have the same answers.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use knowledge::{
@@ -291,6 +291,92 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
     ];
     assert_eq!(empty, expected);
 }
+
+#[test]
+fn owlrl_derives_the_same_statements_before_and_after_a_source_is_removed() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let node_sets = ["devices", "machines"].map(|name| read_own(&format!("nodesets/{name}.xml")));
+    let stage = read_own("mtp/stage.aml");
+    let knowledge = plant(&[("one", stage.clone()), ("two", stage)], &node_sets);
+    knowledge.set_rules(true).unwrap();
+    let ontology = Source::new(SourceKind::File, "ontology.ttl");
+    knowledge.replace_turtle(&ontology, ONTOLOGY, 1).unwrap();
+    let cell_file = Source::new(SourceKind::File, "cell.ttl");
+    knowledge.replace_turtle(&cell_file, CELL, 1).unwrap();
+    let all = are_derived_alike(&cell, &knowledge);
+    assert!(all > 80, "{all} statements are derived");
+    knowledge.remove(&cell_file).unwrap();
+    let fewer = are_derived_alike(&cell, &knowledge);
+    knowledge.remove(&ontology).unwrap();
+    let least = are_derived_alike(&cell, &knowledge);
+    assert!(all > fewer && fewer > least, "{all}, {fewer}, {least}");
+}
+
+/// Compares the derived statements between named nodes. Returns their number.
+fn are_derived_alike(cell: &Cell, knowledge: &Knowledge) -> usize {
+    let mut quads = Vec::new();
+    knowledge.write_quads(None, &mut quads).unwrap();
+    let quads = String::from_utf8(quads).unwrap();
+    let file = cell.file("rules.nq", &quads);
+    let arguments = [file.to_str().unwrap()];
+    let mut judge = cell.asyncua_started("rules_judge.py", &arguments).start();
+    let status = judge.wait_for_end(JUDGED);
+    assert!(status.success(), "the judge ended with {status}: {judge}");
+    let told = judge.json_lines();
+    let theirs: BTreeSet<String> = serde_json::from_value(told[0]["derived"].clone()).unwrap();
+    let split = |line: &str| -> Option<(String, bool)> {
+        let line = line.strip_suffix(" .")?;
+        let (statement, graph) = line.rsplit_once(' ')?;
+        let is_derived = graph == "<urn:ua-bridge:graph:derived>";
+        Some((statement.to_owned(), is_derived))
+    };
+    let (derived, stated): (Vec<_>, Vec<_>) =
+        quads.lines().filter_map(split).partition(|(_, is)| *is);
+    let stated: BTreeSet<String> = stated.into_iter().map(|(line, _)| line).collect();
+    let is_reserved = |term: &str| term.starts_with("<http://www.w3.org/");
+    let is_compared = |line: &String| {
+        let terms: Vec<&str> = line.split(' ').collect();
+        let [subject, predicate, object] = terms.as_slice() else {
+            return false;
+        };
+        let is_named = |term: &str| term.starts_with('<') && !is_reserved(term);
+        let is_hierarchy =
+            predicate.ends_with("#subClassOf>") || predicate.ends_with("#subPropertyOf>");
+        is_named(subject) && is_named(object) && !(is_hierarchy && subject == object)
+    };
+    let ours: BTreeSet<String> = derived
+        .into_iter()
+        .map(|(line, _)| line)
+        .filter(|line| is_compared(line) && !stated.contains(line))
+        .collect();
+    let missing: Vec<_> = theirs.difference(&ours).take(20).collect();
+    let surplus: Vec<_> = ours.difference(&theirs).take(20).collect();
+    assert!(
+        missing.is_empty() && surplus.is_empty(),
+        "missing {missing:#?}, surplus {surplus:#?}"
+    );
+    ours.len()
+}
+
+/// Terms with all rules.
+const ONTOLOGY: &str = "@prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> .
+    @prefix owl: <http://www.w3.org/2002/07/owl#> . @prefix : <urn:example:cell#> .
+    @prefix css: <http://www.w3id.org/hsu-aut/css#> .
+    css:isRealizedBySkill rdfs:domain css:Capability ; rdfs:range css:Skill ; owl:inverseOf css:realizes .
+    css:providesSkill rdfs:subPropertyOf css:offers . css:offers rdfs:domain css:Resource .
+    css:Resource owl:equivalentClass :Device .
+    :Gripper rdfs:subClassOf :Tool . :Tool rdfs:subClassOf :Device . :Werkzeug owl:equivalentClass :Tool .
+    :hasPart a owl:TransitiveProperty ; owl:inverseOf :isPartOf ; rdfs:domain :Assembly ;
+        rdfs:subPropertyOf :relatesTo .
+    :hasScrew rdfs:subPropertyOf :hasPart . :mounts owl:equivalentProperty :hasPart .
+    :touches a owl:SymmetricProperty ; rdfs:subPropertyOf :near . :near a owl:TransitiveProperty .
+    :relatesTo rdfs:range :Thing .";
+const CELL: &str = "@prefix : <urn:example:cell#> .
+    :cell :hasPart :robot . :robot :hasPart :hand . :hand :mounts :gripper . :gripper :hasScrew :screw .
+    :screw :isPartOf :box . :robot :touches :table . :table :touches :floor . :floor :near :robot .
+    :gripper a :Gripper . :table a :Werkzeug . :screw :relatesTo :cell .";
 
 /// Time limit of rdflib for all queries. It takes about 6 s of processor time.
 const JUDGED: Duration = Duration::from_secs(180);

@@ -406,6 +406,7 @@ impl Cell {
             "components": components,
             "gone": present.gone,
             "graphs": self.knowledge.sources(),
+            "rules": self.knowledge.rules(),
             "findings": findings,
             "processes": processes.collect::<Vec<_>>(),
             "runs": self.runs.all(),

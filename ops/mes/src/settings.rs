@@ -34,6 +34,8 @@ pub(crate) struct Settings {
     pub(crate) sparql: SocketAddr,
     /// The folder of the lasting sources.
     pub(crate) store: Option<PathBuf>,
+    /// Whether the rules of OWL 2 RL are applied.
+    pub(crate) rules: bool,
     /// Turtle files.
     pub(crate) knowledge: Vec<Source>,
     pub(crate) nodesets: Vec<Source>,
@@ -68,7 +70,7 @@ impl Settings {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 16] = [
+const KEYS: [&str; 17] = [
     "mes",
     "application_uri",
     "namespace",
@@ -79,6 +81,7 @@ const KEYS: [&str; 16] = [
     "user",
     "sparql",
     "store",
+    "rules",
     "knowledge",
     "nodesets",
     "manifests",
@@ -105,6 +108,7 @@ impl Reading<'_> {
             user,
             sparql,
             store,
+            rules,
             knowledge,
             nodesets,
             manifests,
@@ -124,14 +128,10 @@ impl Reading<'_> {
             .reader
             .needed(namespace, "namespace", root.place)
             .and_then(|node| self.namespace(node));
-        let endpoint = match endpoint {
-            Some(node) => self.endpoint(node),
-            None => Some(DEFAULT_ENDPOINT.to_owned()),
-        };
-        let security = match security {
-            Some(node) => self.security(node),
-            None => Some(vec![Security::None]),
-        };
+        let usual = || Some(DEFAULT_ENDPOINT.to_owned());
+        let endpoint = endpoint.map_or_else(usual, |node| self.endpoint(node));
+        let usual = || Some(vec![Security::None]);
+        let security = security.map_or_else(usual, |node| self.security(node));
         let lds = lds.map_or(Some(Lds::Local), |node| self.lds(node));
         let open = open.map_or(Some(false), |node| self.reader.boolean(node));
         let user = match user {
@@ -143,6 +143,7 @@ impl Reading<'_> {
             Some(node) => Some(self.reader.text(node, "the path of a folder")?),
             None => None,
         };
+        let rules = rules.map_or(Some(false), |node| self.reader.boolean(node));
         let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
         let nodesets = nodesets.map_or_else(Vec::new, |node| self.files(node));
         let manifests = manifests.map_or_else(Vec::new, |node| self.each(node, Self::manifest));
@@ -166,6 +167,7 @@ impl Reading<'_> {
             user,
             sparql: sparql?,
             store: store.map(|path| self.folder.join(path)),
+            rules: rules?,
             knowledge,
             nodesets,
             manifests,

@@ -122,6 +122,13 @@ impl Sources {
                 warn!(source = source.name, "cannot remove a source: {fault}");
             }
         }
+        self.rules(settings.rules);
+    }
+
+    fn rules(&self, are_on: bool) {
+        if let Err(fault) = self.knowledge.set_rules(are_on) {
+            warn!("cannot apply the rules: {fault}");
+        }
     }
 
     /// Returns all findings.

@@ -12,8 +12,8 @@
 //! This crate calls no server and discovers nothing: facts are plain data with the name of their
 //! source.
 //!
-//! Reading order: `source` (the named graphs), `store`, `writing` (replacement and derivation) and
-//! `journal` (lasting sources), `component` and `nodeset` (facts to statements), `question` (named
+//! Reading order: `source` (the named graphs), `store`, `writing` (replacement), `rules` (derived
+//! statements), `journal` (lasting sources), `component` and `nodeset` (facts to statements), `question` (named
 //! queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the queries that run at a
 //! time), `http`, `update` and `writes` (changes by users), `shapes` and `checking` (the SHACL
 //! report), `units` (conversion of numbers).
@@ -28,6 +28,7 @@ pub mod nodeset;
 pub mod owl;
 mod query;
 mod question;
+mod rules;
 mod shapes;
 mod source;
 mod store;

@@ -17,6 +17,7 @@ use thiserror::Error;
 use tokio::sync::watch;
 
 use crate::journal::Journal;
+use crate::rules::apply::{Derived, Rules};
 use crate::source::{Source, SourceKind};
 use crate::vocabulary;
 use crate::writing::{Change, Writing, derive};
@@ -81,6 +82,7 @@ pub struct Knowledge {
 pub(crate) struct Written {
     pub(crate) sources: BTreeMap<Source, SourceStatus>,
     pub(crate) journal: Option<Journal>,
+    pub(crate) rules: Rules,
 }
 
 /// Whether a source outlasts the program.
@@ -144,15 +146,47 @@ impl Knowledge {
             status.statements = graph.triples.len();
             status.lasting = true;
         }
-        let mut transaction = knowledge.store.start_transaction()?;
-        let derived = derive(&mut transaction)?;
-        transaction.commit()?;
-        if !written.sources.is_empty() {
-            written.count_derived(derived);
-        }
         written.journal = Some(journal);
+        knowledge.derive_anew(&mut written, Rules::Off)?;
         drop(written);
         Ok((knowledge, restored.damaged))
+    }
+
+    /// Applies the rules of OWL 2 RL, or only that of subclasses. The derived statements are a
+    /// graph of their own, and part of the merge of all graphs.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`]; then nothing has changed.
+    pub fn set_rules(&self, are_on: bool) -> Result<(), KnowledgeFault> {
+        let mut written = self.written();
+        let rules = match (are_on, &written.rules) {
+            (true, Rules::Off) => Rules::Suspended,
+            (false, Rules::On(_) | Rules::Suspended) => Rules::Off,
+            (true, Rules::On(_) | Rules::Suspended) | (false, Rules::Off) => return Ok(()),
+        };
+        self.derive_anew(&mut written, rules)?;
+        drop(written);
+        self.changed.send_modify(|changes| *changes += 1);
+        Ok(())
+    }
+
+    /// Returns whether the rules of OWL 2 RL are `on`, `off`, or `suspended` because too many
+    /// statements follow.
+    pub fn rules(&self) -> &'static str {
+        self.written().rules.name()
+    }
+
+    fn derive_anew(&self, written: &mut Written, rules: Rules) -> Result<(), KnowledgeFault> {
+        let mut transaction = self.store.start_transaction()?;
+        let derived = rules.anew(&transaction)?;
+        derive(&mut transaction, &derived)?;
+        transaction.commit()?;
+        if !written.sources.is_empty() {
+            written.derived(derived);
+        } else if let Some(rules) = derived.rules {
+            written.rules = rules;
+        }
+        Ok(())
     }
 
     /// Replaces the statements of a source atomically for all readers. `at` is in milliseconds
@@ -388,13 +422,19 @@ impl Knowledge {
 }
 
 impl Written {
-    /// Updates the status of the derived statements.
-    pub(crate) fn count_derived(&mut self, statements: usize) {
+    /// Updates the rules and the status of the derived statements.
+    pub(crate) fn derived(&mut self, change: Derived) {
         let derived = Source::new(SourceKind::Derived, "");
         let since_ms = self.sources.values().map(|source| source.since_ms).min();
+        let known = self.sources.get(&derived);
+        let known = known.map_or(0, |known| known.statements);
         let mut status = SourceStatus::new(&derived, since_ms.unwrap_or_default());
-        status.statements = statements;
+        let grown = known.saturating_add(change.added.len());
+        status.statements = grown.saturating_sub(change.removed.len());
         self.sources.insert(derived, status);
+        if let Some(rules) = change.rules {
+            self.rules = rules;
+        }
     }
 }
 

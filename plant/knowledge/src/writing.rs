@@ -3,18 +3,17 @@
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::MutexGuard;
 
-use oxigraph::model::{
-    GraphName, GraphNameRef, NamedNode, NamedNodeRef, NamedOrBlankNode, Term, Triple,
-};
+use oxigraph::model::{GraphNameRef, NamedNode, Triple};
 use oxigraph::store::{StorageError, Transaction};
 use tokio::sync::watch;
 
 use crate::journal::Record;
+use crate::rules::apply::Derived;
+use crate::rules::{Extent, Schema};
 use crate::source::{DERIVED, Source, SourceKind};
 use crate::store::{
     KnowledgeFault, Lasting, MAX_SOURCES, MAX_STATEMENTS, SourceStatus, Written, named,
 };
-use crate::vocabulary;
 
 /// A change of a graph: the statements that it removes and adds.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -28,7 +27,10 @@ pub(crate) struct Writing<'a> {
     pub(crate) written: MutexGuard<'a, Written>,
     pub(crate) transaction: Transaction<'a>,
     changed: &'a watch::Sender<u64>,
-    about_classes: bool,
+    /// Whether the change is about the schema of the rules.
+    is_of_schema: bool,
+    /// The changed statements, if the rules need them.
+    touched: HashSet<Triple>,
     /// The changes for the journal.
     changes: BTreeMap<Source, Change>,
     /// Sources that are replaced as a whole, with all their statements.
@@ -48,7 +50,8 @@ impl<'a> Writing<'a> {
             written,
             transaction,
             changed,
-            about_classes: false,
+            is_of_schema: false,
+            touched: HashSet::new(),
             changes: BTreeMap::new(),
             whole: BTreeMap::new(),
             removed: BTreeSet::new(),
@@ -136,9 +139,12 @@ impl<'a> Writing<'a> {
             &effective.added,
             &effective.removed,
         )?;
-        let sub_class = vocabulary::RDFS_SUB_CLASS_OF;
-        let mut all = effective.added.iter().chain(&effective.removed);
-        self.about_classes |= all.any(|triple| triple.predicate.as_str() == sub_class);
+        let extent = self.written.rules.extent();
+        let all = || effective.added.iter().chain(&effective.removed);
+        self.is_of_schema |= all().any(|triple| Schema::has(triple, extent));
+        if extent == Extent::OwlRl {
+            self.touched.extend(all().cloned());
+        }
         let count = effective.added.len() + effective.removed.len();
         let kept = self.changes.entry(source.clone()).or_default();
         kept.then(effective);
@@ -183,10 +189,12 @@ impl<'a> Writing<'a> {
             }
             statuses.push((source.clone(), status));
         }
-        let derived = match self.about_classes {
-            true => Some(derive(&mut self.transaction)?),
-            false => None,
+        let rules = &self.written.rules;
+        let derived = match self.is_of_schema {
+            true => rules.after_schema(&self.transaction, &self.touched)?,
+            false => rules.after(&self.transaction, &self.touched)?,
         };
+        derive(&mut self.transaction, &derived)?;
         let written = &mut *self.written;
         if let Some(journal) = &mut written.journal {
             let known = &written.sources;
@@ -218,15 +226,7 @@ impl<'a> Writing<'a> {
             written.sources.remove(source);
         }
         written.sources.extend(statuses);
-        match derived {
-            Some(derived) => written.count_derived(derived),
-            None => {
-                let known = Source::new(SourceKind::Derived, "");
-                let known = written.sources.get(&known);
-                let derived = known.map_or(0, |known| known.statements);
-                written.count_derived(derived);
-            }
-        }
+        written.derived(derived);
         self.changed.send_modify(|changes| *changes += 1);
         Ok(())
     }
@@ -243,14 +243,18 @@ impl Change {
     }
 }
 
-/// Updates the graph of derived statements. Returns their number.
-pub(crate) fn derive(transaction: &mut Transaction<'_>) -> Result<usize, KnowledgeFault> {
-    let sub_class = NamedNodeRef::new_unchecked(vocabulary::RDFS_SUB_CLASS_OF);
-    let derived = named(DERIVED)?;
-    let closure = closure(transaction, sub_class, &derived)?;
-    let (added, removed) = difference(transaction, &derived, &closure)?;
-    apply(transaction, &derived, &added, &removed)?;
-    Ok(closure.len())
+/// Changes the graph of derived statements.
+pub(crate) fn derive(
+    transaction: &mut Transaction<'_>,
+    derived: &Derived,
+) -> Result<(), KnowledgeFault> {
+    let graph = named(DERIVED)?;
+    Ok(apply(
+        transaction,
+        &graph,
+        &derived.added,
+        &derived.removed,
+    )?)
 }
 
 /// Returns the statements to add to a graph and to remove from it.
@@ -339,53 +343,3 @@ fn stored(
     let quad = quads.next().transpose()?;
     Ok(quad.map(Triple::from))
 }
-
-/// Applies the rule for subclasses: transitive through any number of classes, and reflexive.
-/// Questions never need a path (`rdfs:subClassOf*`), which the evaluator would follow last and for
-/// all classes.
-fn closure(
-    transaction: &Transaction<'_>,
-    sub_class: NamedNodeRef<'_>,
-    derived: &NamedNode,
-) -> Result<HashSet<Triple>, StorageError> {
-    let mut above: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
-    for quad in transaction.quads_for_pattern(None, Some(sub_class), None, None) {
-        let quad = quad?;
-        let is_direct = matches!(&quad.graph_name, GraphName::NamedNode(graph) if graph != derived);
-        if let (NamedOrBlankNode::NamedNode(class), Term::NamedNode(supertype), true) =
-            (quad.subject, quad.object, is_direct)
-        {
-            above.entry(supertype.as_str().to_owned()).or_default();
-            above
-                .entry(class.into_string())
-                .or_default()
-                .insert(supertype.into_string());
-        }
-    }
-    let mut all = HashSet::new();
-    for class in above.keys() {
-        let mut seen: BTreeSet<&str> = BTreeSet::from([class.as_str()]);
-        let mut waiting = vec![class.as_str()];
-        while let Some(next) = waiting.pop() {
-            let further = above.get(next).into_iter().flatten();
-            waiting.extend(
-                further
-                    .map(String::as_str)
-                    .filter(|further| seen.insert(further)),
-            );
-        }
-        if all.len() + seen.len() > MAX_DERIVED {
-            tracing::warn!(
-                most = MAX_DERIVED,
-                "the limit of stored superclasses is reached: answers about types may be incomplete"
-            );
-            break;
-        }
-        let class = NamedNode::new_unchecked(class);
-        let above = seen.into_iter().map(NamedNode::new_unchecked);
-        all.extend(above.map(|above| Triple::new(class.clone(), sub_class, above)));
-    }
-    Ok(all)
-}
-
-const MAX_DERIVED: usize = 500_000;

@@ -3,6 +3,7 @@
 mod http;
 mod memory;
 mod owl;
+mod rules;
 mod shapes;
 mod store;
 mod vocabulary;
