@@ -21,7 +21,7 @@ pub(crate) use write::Write;
 
 pub(crate) use job::{GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb};
 pub(crate) use module::{
-    AasArguments, MtpAlarms, MtpArguments, MtpRdf, MtpSkills, MtpVerb, PeaArguments,
+    AasArguments, MtpAlarms, MtpArguments, MtpRdf, MtpRun, MtpSkills, MtpVerb, PeaArguments,
 };
 
 use std::path::PathBuf;
@@ -333,7 +333,7 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 65 a file is no NodeSet, 74 a file cannot be read or the output cannot
     /// be written.
     Owl(Owl),
-    /// Read manifests of process modules (MTP): check, skills, RDF
+    /// Read manifests of process modules (MTP): check, skills, RDF, run
     ///
     /// Documents that a manifest refers to are read from its folder or its container.
     ///

@@ -33,6 +33,7 @@ mod messages;
 mod metadata;
 mod mtp_alarms;
 mod mtp_files;
+mod mtp_run;
 mod new;
 mod owl;
 mod packet;

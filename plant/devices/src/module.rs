@@ -18,7 +18,10 @@ use std::sync::Arc;
 
 use mtp::{Module, Parameter, Procedure, Service};
 use skills::yaml::{Code, Kind, Node, Place, Reader};
-use skills::{Device, Driver, DriverFault, DriverSetup, PeerAccess, SkillSetup, TypeName, Value};
+use skills::{
+    Authority, Device, Driver, DriverFault, DriverSetup, Facts, Observer, PeerAccess, Shape, Skill,
+    SkillSetup, TypeName, Value,
+};
 use tokio::sync::Mutex;
 
 pub use handshake::{ModuleNodes, Timing};
@@ -108,6 +111,83 @@ impl ProcessModule {
             skills,
             nodes,
         }
+    }
+
+    /// Starts the skill of a procedure in this process, without a server. A service with several
+    /// procedures needs the name of one, or has a default. Needs a tokio runtime.
+    ///
+    /// # Errors
+    /// [`DriverFault`] if there is no such service or procedure, or it cannot be commanded.
+    pub fn start(
+        &self,
+        service: &str,
+        procedure: Option<&str>,
+        observers: Vec<Box<dyn Observer>>,
+    ) -> Result<Skill, DriverFault> {
+        let names = |all: &mut dyn Iterator<Item = &str>| all.collect::<Vec<_>>().join(", ");
+        let of = |skill: &&ModuleSkill| skill.service.name == service;
+        let of_service: Vec<&ModuleSkill> = self.skills.iter().filter(of).collect();
+        if of_service.is_empty() {
+            let services = self.settings.module.services.iter();
+            let known = names(&mut services.map(|one| one.name.as_str()));
+            return Err(DriverFault(format!(
+                "there is no service `{service}` with procedures; the services are {known}"
+            )));
+        }
+        let found = match (procedure, of_service.as_slice()) {
+            (Some(name), all) => all.iter().find(|skill| skill.procedure.name == name),
+            (None, [only]) => Some(only),
+            (None, all) => all.iter().find(|skill| skill.procedure.is_default),
+        };
+        let Some(found) = found else {
+            let known = names(&mut of_service.iter().map(|one| one.procedure.name.as_str()));
+            let wanted = procedure.map_or_else(
+                || format!("{service} has several procedures and no default"),
+                |name| format!("{service} has no procedure `{name}`"),
+            );
+            return Err(DriverFault(format!("{wanted}; its procedures are {known}")));
+        };
+        self.spawn(found, observers)
+    }
+
+    fn spawn(
+        &self,
+        skill: &ModuleSkill,
+        observers: Vec<Box<dyn Observer>>,
+    ) -> Result<Skill, DriverFault> {
+        let types = vec![self.type_of(skill), TypeName::own("SkillType")];
+        let driver = self.driver(&types, &PeerAccess::default())?;
+        let mut parameters: Vec<_> = self
+            .parameters(skill)
+            .map(|parameter| skills::Parameter {
+                unit: types::unit(parameter.unit.as_ref()).map(str::to_owned),
+                range: types::range(parameter),
+                ..plain(&parameter.name, types::builtin(parameter.kind))
+            })
+            .collect();
+        if procedure::has_run_time(&skill.procedure, self.parameters(skill)) {
+            parameters.push(skills::Parameter {
+                default: Some(Value::Double(0.0)),
+                unit: Some("s".to_owned()),
+                ..plain(procedure::RUN_TIME, skills::Builtin::Double)
+            });
+        }
+        let outputs = procedure::outputs(&skill.service, &skill.procedure);
+        let facts = Facts {
+            name: skill.name.clone(),
+            types,
+            parameters,
+            results: outputs
+                .map(|output| skills::Parameter {
+                    unit: types::unit(output.unit.as_ref()).map(str::to_owned),
+                    ..plain(&output.name, types::builtin(output.kind))
+                })
+                .collect(),
+            capabilities: Vec::new(),
+            timeout: None,
+            rests_in: program::Rest::Ready,
+        };
+        Ok(Skill::spawn(facts, driver, Authority::new(), observers))
     }
 
     /// Returns the URI of the namespace of its skill types.
@@ -213,6 +293,18 @@ impl Device for ProcessModule {
             }
         };
         self.skills.iter().map(setup).collect()
+    }
+}
+
+fn plain(name: &str, builtin: skills::Builtin) -> skills::Parameter {
+    skills::Parameter {
+        name: name.to_owned(),
+        shape: Shape::scalar(builtin),
+        length: None,
+        default: None,
+        unit: None,
+        range: None,
+        about: String::new(),
     }
 }
 

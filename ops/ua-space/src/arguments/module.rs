@@ -20,6 +20,14 @@ pub(crate) enum MtpVerb {
     Skills(MtpSkills),
     /// Print the alarms of a manifest as a part of a mapping: variables with conditions at ua-server
     Alarms(MtpAlarms),
+    /// Run a procedure of a service once, and print its states and results
+    ///
+    /// Follows the handshake of VDI/VDE/NAMUR 2658-4. Ctrl-C withdraws a Start without effect, or
+    /// stops the service; the command ends when the end of the procedure is known.
+    ///
+    /// Exit codes: 0 Completed, 1 not Completed, 64 usage, 65 the file is no manifest, 69 the end is
+    /// unknown, 74 the file cannot be read or the output cannot be written, 130 stopped by Ctrl-C.
+    Run(MtpRun),
 }
 
 #[derive(Debug, Args)]
@@ -52,6 +60,35 @@ pub(crate) struct MtpSkills {
     #[arg(value_name = "FILE")]
     pub(crate) file: String,
     /// Print a JSON array
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MtpRun {
+    /// The manifest (.aml, .mtp, .amlx), or - for stdin
+    #[arg(value_name = "FILE")]
+    pub(crate) file: String,
+    /// The name of the service
+    #[arg(value_name = "SERVICE")]
+    pub(crate) service: String,
+    /// Parameters, as Volume=2.5. RunTime is the time in Execute of a procedure that does not
+    /// complete by itself
+    #[arg(value_name = "NAME=VALUE")]
+    pub(crate) parameters: Vec<String>,
+    /// The name of the procedure, if the service has several
+    #[arg(long, value_name = "NAME")]
+    pub(crate) procedure: Option<String>,
+    /// The endpoint of the module, if it differs from the manifest
+    #[arg(long, value_name = "URL")]
+    pub(crate) endpoint: Option<String>,
+    /// Take and write the parameters of the configuration too
+    #[arg(long)]
+    pub(crate) configuration: bool,
+    /// Stop the procedure if it takes longer
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub(crate) run_timeout: Option<f64>,
+    /// Print a JSON object for each step, and for the end
     #[arg(long)]
     pub(crate) json: bool,
 }

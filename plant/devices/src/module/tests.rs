@@ -8,9 +8,7 @@ use mtp::pea::{Pea, PeaFaults, PeaValue};
 use mtp::state::{Command, State};
 use mtp::{Module, Node};
 use program::Method;
-use skills::{
-    Authority, Device, Facts, Outcome, Owner, Parameter, PeerAccess, Shape, Skill, TypeName, Value,
-};
+use skills::{Device, Outcome, Owner, Skill, Value};
 
 use super::{ModuleNodes, ProcessModule, Settings, Timing};
 
@@ -142,55 +140,9 @@ fn skill(name: &str, faults: PeaFaults, timing: Timing) -> (Skill, Arc<Memory>) 
         timing,
     };
     let device = ProcessModule::over(settings, Arc::<Memory>::clone(&memory));
-    let setup = device
-        .skills()
-        .into_iter()
-        .find(|skill| skill.name == name)
-        .unwrap();
-    let found = device
-        .skills
-        .iter()
-        .find(|skill| skill.name == name)
-        .unwrap();
-    let of_module = device.parameters(found).map(|of| Parameter {
-        name: of.name.clone(),
-        shape: match of.kind {
-            mtp::ValueKind::Analog => Shape::scalar(skills::Builtin::Double),
-            mtp::ValueKind::Integer => Shape::scalar(skills::Builtin::Int32),
-            mtp::ValueKind::Binary => Shape::scalar(skills::Builtin::Boolean),
-            mtp::ValueKind::Text => Shape::scalar(skills::Builtin::String),
-        },
-        length: None,
-        default: None,
-        unit: None,
-        range: None,
-        about: String::new(),
-    });
-    let run_time = Parameter {
-        name: super::procedure::RUN_TIME.to_owned(),
-        shape: Shape::scalar(skills::Builtin::Double),
-        length: None,
-        default: Some(Value::Double(0.0)),
-        unit: None,
-        range: None,
-        about: String::new(),
-    };
-    let parameters = of_module.chain([run_time]).collect();
-    let types = vec![setup.skill_type, TypeName::own("SkillType")];
-    let driver = device.driver(&types, &PeerAccess::default()).unwrap();
-    let facts = Facts {
-        name: name.to_owned(),
-        types,
-        parameters,
-        results: Vec::new(),
-        capabilities: Vec::new(),
-        timeout: None,
-        rests_in: program::Rest::Ready,
-    };
-    (
-        Skill::spawn(facts, driver, Authority::new(), Vec::new()),
-        memory,
-    )
+    let mut all = device.skills.iter();
+    let found = all.find(|skill| skill.name == name).unwrap();
+    (device.spawn(found, Vec::new()).unwrap(), memory)
 }
 
 const BY: Owner = Owner::Local("the test");
@@ -230,6 +182,37 @@ async fn until(memory: &Memory, service: usize, state: State) {
         tokio::time::sleep(Duration::from_millis(1)).await;
     }
     panic!("the service is never {state}");
+}
+
+#[tokio::test]
+async fn a_service_is_started_by_its_name_and_that_of_a_procedure() {
+    let module = stage();
+    let memory = Memory::new(Pea::new(&module));
+    let settings = Settings {
+        module,
+        endpoint: None,
+        capabilities: std::collections::BTreeMap::new(),
+        configuration: false,
+        timing: patient(),
+    };
+    let device = ProcessModule::over(settings, memory);
+    let name =
+        |service: &str, procedure: Option<&str>| match device.start(service, procedure, Vec::new())
+        {
+            Ok(skill) => skill.facts().name.clone(),
+            Err(fault) => fault.0,
+        };
+    assert_eq!(name("Solo", None), "Solo-Polka");
+    assert_eq!(name("Duet", Some("Tango")), "Duet-Tango");
+    assert_eq!(
+        name("Duet", Some("Polka")),
+        "Duet has no procedure `Polka`; its procedures are Waltz, Tango"
+    );
+    let none = name("Trio", None);
+    assert!(
+        none.contains("`Trio`") && none.contains("Duet, Solo"),
+        "{none}"
+    );
 }
 
 #[tokio::test]
@@ -366,18 +349,7 @@ async fn a_service_that_runs_is_not_started_again() {
         timing: patient(),
     };
     let other = ProcessModule::over(settings, nodes);
-    let types = [other.type_of(&other.skills[0])];
-    let driver = other.driver(&types, &PeerAccess::default()).unwrap();
-    let facts = Facts {
-        name: "Duet-Waltz".to_owned(),
-        types: types.to_vec(),
-        parameters: Vec::new(),
-        results: Vec::new(),
-        capabilities: Vec::new(),
-        timeout: None,
-        rests_in: program::Rest::Ready,
-    };
-    let second = Skill::spawn(facts, driver, Authority::new(), Vec::new());
+    let second = other.spawn(&other.skills[0], Vec::new()).unwrap();
     start(&second, &[]).await;
     let outcome = ended(&second).await;
     assert!(

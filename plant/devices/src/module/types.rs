@@ -188,7 +188,7 @@ fn property(
     );
 }
 
-const fn builtin(kind: ValueKind) -> Builtin {
+pub(super) const fn builtin(kind: ValueKind) -> Builtin {
     match kind {
         // A Double takes each number of a user exactly; the module has a Float.
         ValueKind::Analog => Builtin::Double,
@@ -198,12 +198,12 @@ const fn builtin(kind: ValueKind) -> Builtin {
     }
 }
 
-fn unit(bound: Option<&Bound>) -> Option<&'static str> {
+pub(super) fn unit(bound: Option<&Bound>) -> Option<&'static str> {
     bound.and_then(Bound::constant).and_then(unit_symbol)
 }
 
 /// Returns the range of a parameter with both limits in the file.
-fn range(parameter: &Parameter) -> Option<(f64, f64)> {
+pub(super) fn range(parameter: &Parameter) -> Option<(f64, f64)> {
     let low = parameter.min.as_ref()?.constant()?;
     let high = parameter.max.as_ref()?.constant()?;
     (low < high).then_some((low, high))
