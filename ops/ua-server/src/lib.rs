@@ -45,6 +45,7 @@ mod folders;
 mod history;
 mod identity;
 mod layout;
+mod leaving;
 mod methods;
 mod nodes;
 mod nodesets;

@@ -46,6 +46,7 @@ use crate::folders;
 use crate::history::{Past, Room, Series, Store, Stored};
 use crate::identity;
 use crate::layout::{FieldNode, Layout, TopicNode};
+use crate::leaving::{Departing, Departure, LONGEST_WAY_OUT, NOT_ACTIVE, departure};
 use crate::nodesets::Loaded;
 use crate::properties;
 use crate::pubsub::PubSub;
@@ -118,8 +119,8 @@ pub(crate) struct ClientWrite {
     pub(crate) commander: Commander,
     /// Released when the value has been sent.
     pub(crate) room: OwnedSemaphorePermit,
-    /// Notified when the value has been sent.
-    pub(crate) gone_out: oneshot::Sender<()>,
+    /// Receives the result of sending the value.
+    pub(crate) departure: Departure,
     /// Receives the result of the server that the value is written to. Dropped if there is no such
     /// server.
     pub(crate) answer: oneshot::Sender<StatusCode>,
@@ -147,25 +148,13 @@ impl Writer {
 
 /// The pending results of a value that is being sent.
 struct OnItsWay {
-    gone_out: oneshot::Receiver<()>,
+    departing: Departing,
     answered: oneshot::Receiver<StatusCode>,
 }
 
 /// A callback for the fields of a write before it is sent, and the confirmation that the write
 /// waits for.
 type Registration<'r> = (&'r dyn Fn(&[Variant]), Option<Awaited>);
-
-impl OnItsWay {
-    /// Waits until the value has been sent.
-    async fn left(self) -> Result<oneshot::Receiver<StatusCode>, StatusCode> {
-        // The sender is dropped when the server stops or is not the active one any more.
-        match tokio::time::timeout(LONGEST_WAY_OUT, self.gone_out).await {
-            Ok(Ok(())) => Ok(self.answered),
-            Ok(Err(_)) => Err(StatusCode::BadShutdown),
-            Err(_) => Err(StatusCode::BadTimeout),
-        }
-    }
-}
 
 impl SpaceNodes {
     /// Registers the namespaces and adds the nodes of `layout` to `address_space`.
@@ -410,6 +399,22 @@ impl SpaceNodes {
         }
     }
 
+    /// Shows a written value as uncertain that was not sent, unless a newer value replaced it.
+    fn show_not_sent(
+        &self,
+        subscriptions: &SubscriptionCache,
+        topic: &TopicNode,
+        shown_at: DateTime,
+    ) {
+        let _alone = self.writing.lock();
+        let mut shown = self.shown(topic.topic);
+        if shown.stamp.server == shown_at && shown.stamp.status == StatusCode::Good {
+            shown.stamp.status = UNCONFIRMED;
+            shown.stamp.server = DateTime::now();
+            self.show_again(subscriptions, topic, shown);
+        }
+    }
+
     fn put(
         &self,
         subscriptions: &SubscriptionCache,
@@ -629,11 +634,12 @@ impl SpaceNodes {
                 let _alone = self.writing.lock();
                 self.send_alone(writer, place, write, (&|_| {}, awaited))?
             };
-            let answered = on_its_way.left().await?;
-            let status = match tokio::time::timeout(LONGEST_WAY_OUT, answered).await {
+            let left = on_its_way.departing.left().await;
+            // The other server may have the value although the group does not.
+            let status = match tokio::time::timeout(LONGEST_WAY_OUT, on_its_way.answered).await {
                 Ok(Ok(status)) => status,
-                // A reload of the mapping dropped the value.
-                Ok(Err(_)) => StatusCode::BadNoCommunication,
+                // A reload of the mapping or a change of the role dropped the value.
+                Ok(Err(_)) => left.err().unwrap_or(StatusCode::BadNoCommunication),
                 Err(_) => StatusCode::BadTimeout,
             };
             if status.is_bad() {
@@ -645,27 +651,31 @@ impl SpaceNodes {
             }
             return Ok(status);
         }
-        let on_its_way = self.write_and_show(writer, place, (write, awaited))?;
-        on_its_way.left().await?;
+        let (on_its_way, shown_at) = self.write_and_show(writer, place, (write, awaited))?;
+        if let Err(status) = on_its_way.departing.left().await {
+            self.show_not_sent(&writer.subscriptions, &topic, shown_at);
+            return Err(status);
+        }
         if let Some(awaiting) = awaiting {
             awaiting.arrived().await?;
         }
         Ok(StatusCode::Good)
     }
 
-    /// Sends a value and shows it.
+    /// Sends a value and shows it. Returns the server timestamp of the shown value.
     fn write_and_show(
         &self,
         writer: &Writer,
         place: (&TopicNode, Option<usize>),
         (write, awaited): (&ParsedWriteValue, Option<Awaited>),
-    ) -> Result<OnItsWay, StatusCode> {
+    ) -> Result<(OnItsWay, DateTime), StatusCode> {
         // No other write may come between sending and showing, because a write of a single field
         // keeps the current values of the other fields.
         let _alone = self.writing.lock();
         let (sent, on_its_way) = self.send_alone(writer, place, write, (&|_| {}, awaited))?;
+        let shown_at = sent.stamp.server;
         let _shown = self.show(&writer.subscriptions, place.0, sent);
-        Ok(on_its_way)
+        Ok((on_its_way, shown_at))
     }
 
     /// Calls [`send_alone`](Self::send_alone) with the write lock held. The confirmation replaces
@@ -692,9 +702,9 @@ impl SpaceNodes {
         (register, awaited): Registration<'_>,
     ) -> Result<(Shown, OnItsWay), StatusCode> {
         if self.exits.pubsub.is_off(topic.topic) || self.exits.role.is_standby() {
-            // The writer of the topic is disabled, or another server is active, so the value would
+            // The writer of the topic is disabled, or another server is active: the value would
             // not be sent.
-            return Err(StatusCode::BadInvalidState);
+            return Err(NOT_ACTIVE);
         }
         if write
             .value
@@ -743,7 +753,7 @@ impl SpaceNodes {
         let size = u32::try_from(block.len() >> 10).map_err(|_| full)?;
         let room = Arc::clone(&self.exits.room);
         let room = room.try_acquire_many_owned(size).map_err(|_| full)?;
-        let (left, gone_out) = oneshot::channel();
+        let (departure, departing) = departure();
         let (answer, answered) = oneshot::channel();
         let write = ClientWrite {
             topic: topic.topic,
@@ -751,12 +761,15 @@ impl SpaceNodes {
             source,
             commander,
             room,
-            gone_out: left,
+            departure,
             answer,
             awaited,
         };
         self.exits.writes.try_send(write).map_err(|_| full)?;
-        Ok(OnItsWay { gone_out, answered })
+        Ok(OnItsWay {
+            departing,
+            answered,
+        })
     }
 
     fn program(&self, method: &NodeId) -> Option<Drive> {
@@ -1265,8 +1278,6 @@ const UNCONFIRMED: StatusCode = StatusCode::UncertainLastUsableValue;
 /// A sampling interval that is practically zero, but above the 0 that the library treats as "not
 /// requested".
 const AS_IT_COMES_MS: f64 = 0.000_1;
-/// Time limit for a write to be sent by the run loop.
-const LONGEST_WAY_OUT: Duration = Duration::from_secs(10);
 const SECOND_LOOK: Duration = Duration::from_millis(100);
 /// Size limit of all current values, in bytes.
 const MOST_HELD: usize = 512 << 20;

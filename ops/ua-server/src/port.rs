@@ -31,7 +31,7 @@ use plant_opcua::server::{
 };
 use plant_opcua::users::{self, Access, UserFault};
 use tokio::runtime::Runtime;
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use tokio::sync::{Semaphore, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tracing::{info, warn};
@@ -48,6 +48,7 @@ use crate::confirm::Confirms;
 use crate::endpoint;
 use crate::history::{self, Store, Stored};
 use crate::layout::{Layout, LayoutError};
+use crate::leaving::Leaving;
 use crate::methods::{Methods, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::nodesets;
@@ -121,8 +122,8 @@ pub(crate) struct ServerPort {
     alarms: Arc<Alarms>,
     /// The sessions that wrote commands. Their topics are stopped when the session is lost.
     commanders: Commanders,
-    /// Notified when the last reported write has been sent.
-    leaving: Option<oneshot::Sender<()>>,
+    /// The written values that are not sent yet.
+    leaving: Leaving,
     /// Time without messages after which a publisher counts as offline.
     receive_timeout: Duration,
     /// The application as it is described to the group.
@@ -228,7 +229,7 @@ impl ServerPort {
             confirms,
             alarms,
             commanders: Commanders::new(mapping),
-            leaving: None,
+            leaving: Leaving::default(),
             receive_timeout: mapping.pubsub().receive_timeout,
             application,
             certificates,
@@ -278,11 +279,6 @@ impl ServerPort {
 
 impl Port for ServerPort {
     async fn recv(&mut self) -> PortEvent {
-        // The event that was reported before has been handled.
-        if let Some(gone_out) = self.leaving.take() {
-            // The client of the write may be lost.
-            let _gone = gone_out.send(());
-        }
         self.space.settle();
         if let Some(topic) = self.unbound.pop_front() {
             return PortEvent::Unbound { topic };
@@ -295,17 +291,18 @@ impl Port for ServerPort {
                 return PortEvent::Live { topic, live };
             }
             tokio::select! {
+                () = tokio::task::yield_now(), if self.leaving.polls() => {}
                 Some(write) = self.writes.recv() => {
-                    let ClientWrite { topic, block, source, commander, room, gone_out, answer, awaited } = write;
+                    let ClientWrite { topic, block, source, commander, room, departure, answer, awaited } = write;
                     if self.role.is_standby() {
-                        // The role has changed since the client wrote. Its write fails, because
-                        // `gone_out` is dropped.
+                        // The role has changed since the client wrote.
+                        departure.refuse();
                         let (reason, why) = (Reason::Takeover, "standby");
                         return PortEvent::Lost { topic: Some(topic), reason, why, count: 1 };
                     }
                     self.commanders.wrote(topic, commander);
                     drop(room);
-                    self.leaving = Some(gone_out);
+                    self.leaving.add(topic, departure);
                     self.confirms.supersede(topic);
                     self.confirms.arrivals.sent(topic, awaited);
                     self.others.sources.write(topic, &block, answer);
@@ -386,6 +383,14 @@ impl Port for ServerPort {
         _described: Option<&Described>,
     ) {
         // Values of every type have a node.
+    }
+
+    fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
+        self.leaving.left(topic, sent);
+    }
+
+    fn drained(&mut self, is_muted: bool) {
+        self.leaving.drained(is_muted);
     }
 
     fn settled(&mut self, topic: TopicId, arrival: &Arrival) {

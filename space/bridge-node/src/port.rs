@@ -46,6 +46,18 @@ pub trait Port: Send + 'static {
         Handover::Done
     }
 
+    /// Notes that a sample of this side was sent to the group, or the reason why it is not sent.
+    fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
+        let _nobody_waits = (topic, sent);
+    }
+
+    /// Notes that the outputs of all reported events were carried out. A reported sample that has
+    /// not [`left`](Self::left) equals the previous sample or waits for its turn; if this program
+    /// is muted because another program is active, it is not sent.
+    fn drained(&mut self, is_muted: bool) {
+        let _nobody_waits = is_muted;
+    }
+
     /// Receives the outcome of the newest value of a topic of this side that bridges confirm.
     fn settled(&mut self, topic: TopicId, arrival: &Arrival) {
         let _nobody_waits = (topic, arrival);

@@ -428,8 +428,8 @@ impl<P: Port> Shell<P> {
                 };
                 let now = now();
                 self.busy.arrived(now.monotonic);
-                // The Router counts the verdict.
-                let _verdict = self.router.handle_local(heard, now);
+                let verdict = self.router.handle_local(heard, now);
+                self.judged(topic, verdict);
             }
             PortEvent::Qualified {
                 topic,
@@ -500,6 +500,8 @@ impl<P: Port> Shell<P> {
         for _ in 0..DRAINED_AT_ONCE {
             let Some(output) = self.router.poll_output(now()) else {
                 self.flush();
+                let is_muted = self.is_muted();
+                self.port.drained(is_muted);
                 return false;
             };
             if !matches!(output, Output::Datagram { .. }) {

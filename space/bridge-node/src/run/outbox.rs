@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use bridge_core::{Reason, Redundancy};
+use bridge_core::{Reason, Redundancy, Verdict};
 use mappings::TopicId;
 use transport::{Outgoing, SendError};
 
@@ -55,28 +55,50 @@ impl<P: Port> Shell<P> {
     pub(super) fn flush(&mut self) {
         let mut parcels = std::mem::take(&mut self.outbox.0);
         // The lease may have ended since the datagrams were posted: another bridge is active.
-        let redundancy = self.router.redundancy();
-        if redundancy.is_some_and(Redundancy::mutes_group) {
+        if self.is_muted() {
             for parcel in parcels.drain(..) {
-                for topic in std::iter::once(parcel.topic).chain(parcel.with) {
-                    self.router.not_sent(topic, Reason::Takeover, MUTED);
-                }
-                self.router.recycle(parcel.bytes);
+                self.parcel_left(parcel, Err((Reason::Takeover, MUTED)));
             }
             self.outbox.0 = parcels;
             return;
         }
         let errors = self.send_all(&parcels);
         for (index, parcel) in parcels.drain(..).enumerate() {
-            if let Some(error) = errors.get(&index) {
-                let (reason, detail) = (not_sent(*error), error.to_string());
-                for topic in std::iter::once(parcel.topic).chain(parcel.with) {
-                    self.router.not_sent(topic, reason, &detail);
+            match errors.get(&index) {
+                Some(error) => {
+                    let detail = error.to_string();
+                    self.parcel_left(parcel, Err((not_sent(*error), &detail)));
                 }
+                None => self.parcel_left(parcel, Ok(())),
             }
-            self.router.recycle(parcel.bytes);
         }
         self.outbox.0 = parcels;
+    }
+
+    /// Returns whether nothing is sent to the group, because another program is active.
+    pub(super) fn is_muted(&self) -> bool {
+        let redundancy = self.router.redundancy();
+        redundancy.is_some_and(Redundancy::mutes_group)
+    }
+
+    /// Reports the verdict on a sample of the port that is dropped. The Router has counted it. An
+    /// unchanged sample was sent before.
+    pub(super) fn judged(&mut self, topic: TopicId, verdict: Verdict) {
+        if let Verdict::Drop(reason) = verdict
+            && reason != Reason::Unchanged
+        {
+            self.port.left(topic, Err(reason));
+        }
+    }
+
+    fn parcel_left(&mut self, parcel: Parcel, sent: Result<(), (Reason, &str)>) {
+        for topic in std::iter::once(parcel.topic).chain(parcel.with) {
+            if let Err((reason, detail)) = sent {
+                self.router.not_sent(topic, reason, detail);
+            }
+            self.port.left(topic, sent.map_err(|(reason, _)| reason));
+        }
+        self.router.recycle(parcel.bytes);
     }
 
     fn send_all(&mut self, parcels: &[Parcel]) -> BTreeMap<usize, SendError> {
