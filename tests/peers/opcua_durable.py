@@ -1,5 +1,7 @@
 """Leaves a server with two subscriptions, of which one is durable, and looks from another session
-when the other one has ended. It prints the statuses of taking over both.
+when the other one has ended. It prints the statuses of taking over both. Then it makes further
+subscriptions durable until the server refuses it, and prints their number, the status, and the
+number of rejected requests.
 """
 
 import argparse
@@ -11,6 +13,10 @@ import lifetime
 from opcua_services import Server, durable, statuses
 
 COUNT = ua.NodeId(ua.ObjectIds.Server_ServerDiagnostics_ServerDiagnosticsSummary_CurrentSubscriptionCount)
+REJECTED = ua.NodeId(ua.ObjectIds.Server_ServerDiagnostics_ServerDiagnosticsSummary_RejectedRequestsCount)
+# A session has at most 50 subscriptions.
+OF_A_SESSION = 50
+MOST_SESSIONS = 4
 # A lifetime of 3 s: long enough to prepare both subscriptions on a busy machine.
 SHORT = {
     "RequestedPublishingInterval": 20.0,
@@ -23,6 +29,25 @@ SHORT = {
 async def transferred(server, subscription):
     fields = {"SubscriptionIds": [subscription], "SendInitialValues": False}
     return statuses(await server.one("TransferSubscriptions", **fields))
+
+
+async def filled(endpoint):
+    """Returns the number of subscriptions that become durable, and the status of the next."""
+    clients, made, status = [], 0, None
+    while status is None and len(clients) < MOST_SESSIONS:
+        client = Client(endpoint, timeout=20)
+        await client.connect()
+        clients.append(client)
+        server = Server(client, None)
+        for _ in range(OF_A_SESSION):
+            result = await durable(server, await server.subscribed(), 1)
+            if not result.StatusCode.is_good():
+                status = result.StatusCode.name
+                break
+            made += 1
+    for client in clients:
+        await client.disconnect()
+    return made, status
 
 
 async def run(endpoint):
@@ -42,6 +67,10 @@ async def run(endpoint):
         while await client.get_node(COUNT).read_value() > 1:
             await asyncio.sleep(0.02)
         lifetime.say(plain=await transferred(server, plain), durable=await transferred(server, kept))
+        before = await client.get_node(REJECTED).read_value()
+        made, status = await filled(endpoint)
+        rejected = await client.get_node(REJECTED).read_value() - before
+        lifetime.say(made=made, refused=status, rejected=rejected)
 
 
 def main():

@@ -604,6 +604,186 @@ row("HistoryRead", "5.11.3", "no nodes", "BadNothingToDo")(
 )
 
 
+async def history(server, wanted):
+    details = ua.ReadRawModifiedDetails()
+    details.StartTime, details.NumValuesPerNode = datetime.datetime(2020, 1, 1), 1
+    details.IsReadModified, details.ReturnBounds = wanted.get("modified", False), False
+    node = ua.HistoryReadValueId()
+    node.NodeId, node.ContinuationPoint = wanted.get("node", NUMBER), wanted.get("point")
+    result = await server.one(
+        "HistoryRead",
+        HistoryReadDetails=wanted.get("details", details),
+        TimestampsToReturn=wanted.get("timestamps", ua.TimestampsToReturn.Both),
+        ReleaseContinuationPoints=False,
+        NodesToRead=[node],
+    )
+    return result.StatusCode
+
+
+rows(
+    "HistoryRead",
+    "5.11.3",
+    [
+        ("values", "Good", {}),
+        ("modified values", "BadHistoryOperationUnsupported", {"modified": True}),
+        ("an unknown node", "BadNodeIdUnknown", {"node": UNKNOWN}),
+        ("a node without history", "BadHistoryOperationUnsupported", {"node": TIME}),
+        ("an unknown continuation point", "BadContinuationPointInvalid", {"point": b"none"}),
+        ("invalid TimestampsToReturn", "BadTimestampsToReturnInvalid", {"timestamps": ua.TimestampsToReturn.Invalid}),
+        ("no timestamps", "BadTimestampsToReturnInvalid", {"timestamps": ua.TimestampsToReturn.Neither}),
+        ("details that are no details", "BadHistoryOperationInvalid", {"details": ua.DataChangeFilter()}),
+    ],
+    history,
+)
+
+
+row("HistoryUpdate", "5.11.5", "no details", "BadNothingToDo")(
+    lambda server: server.ask("HistoryUpdate", HistoryUpdateDetails=[])
+)
+
+
+@row("HistoryUpdate", "5.11.5", "the deletion of values", "BadHistoryOperationUnsupported")
+async def _(server):
+    details = ua.DeleteRawModifiedDetails()
+    details.NodeId = NUMBER
+    return (await server.one("HistoryUpdate", HistoryUpdateDetails=[details])).StatusCode
+
+
+def changed(server, wanted):
+    service, field, item, fields = wanted
+    changed = item()
+    for name, value in fields.items():
+        setattr(changed, name, value)
+    return server.ask(service, **{field: [changed] if fields else []})
+
+
+ADDED = {
+    "ParentNodeId": ua.ExpandedNodeId(85),
+    "ReferenceTypeId": ua.NodeId(ua.ObjectIds.Organizes),
+    "RequestedNewNodeId": ua.ExpandedNodeId(9998, 2),
+    "BrowseName": ua.QualifiedName("added", 2),
+    "NodeClass": ua.NodeClass.Object,
+    "NodeAttributes": ua.ObjectAttributes(),
+    "TypeDefinition": ua.ExpandedNodeId(ua.ObjectIds.BaseObjectType),
+}
+LINKED = {
+    "SourceNodeId": OBJECTS,
+    "ReferenceTypeId": ua.NodeId(ua.ObjectIds.Organizes),
+    "IsForward": True,
+    "TargetNodeId": ua.ExpandedNodeId(30, 2),
+    "TargetNodeClass": ua.NodeClass.Variable,
+}
+UNLINKED = {name: value for name, value in LINKED.items() if name != "TargetNodeClass"}
+for service, clause, case, field, item, fields in (
+    ("AddNodes", "5.8.2", "nodes", "NodesToAdd", ua.AddNodesItem, ADDED),
+    ("AddReferences", "5.8.3", "references", "ReferencesToAdd", ua.AddReferencesItem, LINKED),
+    ("DeleteNodes", "5.8.4", "nodes", "NodesToDelete", ua.DeleteNodesItem, {"NodeId": NUMBER}),
+    ("DeleteReferences", "5.8.5", "references", "ReferencesToDelete", ua.DeleteReferencesItem, UNLINKED),
+):
+    rows(
+        service,
+        clause,
+        [
+            (f"no {case}", "BadNothingToDo", (service, field, item, {})),
+            ("a change of the address space", "BadServiceUnsupported", (service, field, item, fields)),
+        ],
+        changed,
+    )
+row("QueryFirst", "5.10.3", "no types", "BadNothingToDo")(lambda server: server.ask("QueryFirst", View=view()))
+row("QueryNext", "5.10.4", "an unknown continuation point", "BadContinuationPointInvalid")(
+    lambda server: server.ask("QueryNext", ContinuationPoint=b"none")
+)
+
+
+@row("QueryFirst", "5.10.3", "a query", "BadServiceUnsupported")
+async def _(server):
+    kind = ua.NodeTypeDescription()
+    kind.TypeDefinitionNode, kind.IncludeSubTypes = ua.ExpandedNodeId(ua.ObjectIds.BaseObjectType), True
+    request = ua.QueryFirstRequest()
+    request.Parameters.View, request.Parameters.NodeTypes = view(), [kind]
+    data = await server.client.uaclient.protocol.send_request(request, 10)
+    # The response is no ServiceFault.
+    return struct_from_binary(ua.QueryFirstResponse, data).ResponseHeader.ServiceResult
+
+
+rows(
+    "RegisterNodes",
+    "5.9.5",
+    [("a node", "Good", NUMBER)],
+    lambda server, node: server.ask("RegisterNodes", NodesToRegister=[node]),
+)
+rows(
+    "UnregisterNodes",
+    "5.9.6",
+    [("a node", "Good", NUMBER), ("an unknown node", "Good", UNKNOWN)],
+    lambda server, node: server.ask("UnregisterNodes", NodesToUnregister=[node]),
+)
+row("FindServers", "5.5.2", "all servers", "Good")(lambda server: server.ask("FindServers"))
+row("GetEndpoints", "5.5.4", "all endpoints", "Good")(lambda server: server.ask("GetEndpoints"))
+row("FindServersOnNetwork", "5.5.3", "all servers", "BadServiceUnsupported")(
+    lambda server: server.ask("FindServersOnNetwork")
+)
+row("RegisterServer", "5.5.5", "a server", "BadServiceUnsupported")(lambda server: registered(server, "RegisterServer"))
+row("RegisterServer2", "5.5.6", "a server", "BadServiceUnsupported")(
+    lambda server: registered(server, "RegisterServer2")
+)
+
+
+def registered(server, service):
+    request = getattr(ua, f"{service}Request")()
+    (getattr(request, "Parameters", None) or request).Server = ua.RegisteredServer()
+    return server.send(request, server.client)
+
+
+@row("CreateSubscription", "5.14.2", "publishing intervals", "0 is 10, -1 is 10, 125.5 is 125.5")
+async def _(server):
+    found = []
+    for wanted in (0.0, -1.0, 125.5):
+        made = await server.ask("CreateSubscription", RequestedPublishingInterval=wanted)
+        await server.ask("DeleteSubscriptions", SubscriptionIds=[made.SubscriptionId])
+        found.append(f"{wanted:g} is {made.RevisedPublishingInterval:g}")
+    return ", ".join(found)
+
+
+@row("ModifySubscription", "5.14.3", "publishing intervals", "0 is 10, 125.5 is 125.5")
+async def _(server):
+    subscription, found = await server.subscribed(), []
+    for wanted in (0.0, 125.5):
+        fields = {"SubscriptionId": subscription, "RequestedPublishingInterval": wanted}
+        changed = await server.ask("ModifySubscription", **fields)
+        found.append(f"{wanted:g} is {changed.RevisedPublishingInterval:g}")
+    await server.ask("DeleteSubscriptions", SubscriptionIds=[subscription])
+    return ", ".join(found)
+
+
+row("SetPublishingMode", "5.14.4", "a subscription", "Good")(
+    lambda server: server.ask("SetPublishingMode", PublishingEnabled=False, SubscriptionIds=[server.subscription])
+)
+row("TransferSubscriptions", "5.14.7", "another session of an anonymous user without security", "BadUserAccessDenied")(
+    lambda server: server.ask("TransferSubscriptions", server.other, SubscriptionIds=[server.subscription])
+)
+
+
+@row("DeleteSubscriptions", "5.14.8", "a subscription, twice", "Good BadSubscriptionIdInvalid")
+async def _(server):
+    subscription = await server.subscribed()
+    answers = [await server.ask("DeleteSubscriptions", SubscriptionIds=[subscription]) for _ in range(2)]
+    return " ".join(statuses(one) for one in answers)
+
+
+@row("CloseSession", "5.7.4", "a session, then a Read of it", "Good BadSessionIdInvalid")
+async def _(server):
+    client = Client(server.client.server_url.geturl(), timeout=20)
+    await client.connect()
+    leaving = Server(client, None)
+    request = ua.CloseSessionRequest()
+    request.DeleteSubscriptions = True
+    closed = await outcome(leaving.send(request, client))
+    read = await outcome(leaving.read({}))
+    client.disconnect_socket()
+    return f"{closed} {read}"
+
+
 @row("Publish", "5.14.5", "ten requests of a subscription", "10 wait")
 async def _(server):
     made = await server.ask(

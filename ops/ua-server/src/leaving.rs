@@ -175,7 +175,11 @@ mod tests {
         let waits = answer(|leaving| leaving.drained(false)).await;
         assert_eq!(waits, Ok(()));
         let other = answer(|leaving| leaving.left(topic(31), Ok(()))).await;
-        assert_eq!(other, Err(StatusCode::BadShutdown), "another topic was sent");
+        assert_eq!(
+            other,
+            Err(StatusCode::BadShutdown),
+            "another topic was sent"
+        );
     }
 
     #[tokio::test]

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use plant_opcua::client::{Client, Notice, Sampled, Subscription, Watch};
 use plant_opcua::types::Variant;
-use system_tests::{Times, micros, now, resident};
+use system_tests::{Times, cpu_share, micros, now, resident};
 use tokio::runtime::Runtime;
 
 use crate::feed::PERIOD;
@@ -20,10 +20,10 @@ pub(crate) fn measure(runtime: &Runtime, servers: &mut [Server], seconds: u64) {
         PUBLISHING.as_millis()
     );
     println!(
-        "| server | all told after | changes due | changes seen | lost of these | p50 | p99 | later than {} ms | CPU share | in RAM |",
+        "| server | all told after | changes due | changes seen | lost of these | p50 | p99 | later than {} ms | CPU share | idle | in RAM |",
         LATE.as_millis()
     );
-    println!("|---|---|---|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|---|---|---|");
     for server in servers {
         row(runtime, server, seconds);
     }
@@ -33,6 +33,8 @@ fn row(runtime: &Runtime, server: &mut Server, seconds: u64) {
     let began = Instant::now();
     let (client, mut values) = runtime.block_on(subscribed(server.endpoint));
     let made = began.elapsed();
+    // No value changes.
+    let idle = cpu_share(server.id(), IDLE);
     server.change(true);
     let seconds = Duration::from_secs(seconds);
     let watched = runtime.block_on(async {
@@ -57,13 +59,14 @@ fn row(runtime: &Runtime, server: &mut Server, seconds: u64) {
         ticks * ITEMS,
     );
     println!(
-        "| {} | {:.0} | {due} | {changes} | {} | {:.1} | {:.1} | {late} | {:.0} % | {:.0} MB |",
+        "| {} | {:.0} | {due} | {changes} | {} | {:.1} | {:.1} | {late} | {:.0} % | {:.1} % | {:.0} MB |",
         server.name,
         made.as_secs_f64() * 1e3,
         changes.saturating_sub(distinct),
         delays.at(0.5) / 1e3,
         delays.at(0.99) / 1e3,
         used.as_secs_f64() / seconds.as_secs_f64() * 100.0,
+        idle * 100.0,
         resident(server.id()) as f64 / 1e6
     );
     assert_eq!(values.dropped(), 0, "the client itself has lost some");
@@ -155,4 +158,6 @@ const PUBLISHING: Duration = Duration::from_millis(100);
 const LATE: Duration = Duration::from_millis(200);
 /// Number of notifications that may wait in the client.
 const ROOM: usize = 200_000;
+/// Duration of the measurement without changes.
+const IDLE: Duration = Duration::from_secs(10);
 const SETTLING: Duration = Duration::from_secs(2);

@@ -1,6 +1,7 @@
 //! `cargo xtask bench opcua`: ua-server compared with third-party servers, with the same client for
 //! all, and the delivery of values of the space to clients.
 
+mod confirmed;
 mod connect;
 mod feed;
 mod items;
@@ -24,7 +25,7 @@ fn main() -> ExitCode {
         print!("{HELP}");
         return ExitCode::SUCCESS;
     }
-    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua, Peer::Ros2]) else {
         return ExitCode::FAILURE;
     };
     // The runtime's threads are in the network of this thread.
@@ -44,6 +45,9 @@ fn main() -> ExitCode {
         if plan.has("items") {
             items::measure(&runtime, &mut servers, plan.seconds);
         }
+    }
+    if plan.has("confirmed") {
+        runtime.block_on(confirmed::measure(&cell, plan.requests));
     }
     if plan.has("latency") {
         latency::measure(&cell, &runtime, plan.requests);
@@ -118,7 +122,15 @@ fn positive(arg: Option<&String>) -> Option<usize> {
 
 /// Parts that need all servers.
 const BESIDE: [&str; 3] = ["services", "connect", "items"];
-const PARTS: [&str; 6] = ["services", "connect", "items", "latency", "rate", "nodes"];
+const PARTS: [&str; 7] = [
+    "services",
+    "connect",
+    "items",
+    "confirmed",
+    "latency",
+    "rate",
+    "nodes",
+];
 
 const HELP: &str = "\
 bench-opcua [--quick] [--requests N] [--connects N] [--seconds N] [--nodes N] [PART..]
@@ -128,5 +140,5 @@ bench-opcua [--quick] [--requests N] [--connects N] [--seconds N] [--nodes N] [P
   --connects N   connections with each policy to each server, 50 unless told
   --seconds N    how long values change, 20 unless told
   --nodes N      variables in the largest address space, 100000 unless told
-  PART           services, connect, items, latency, rate, nodes; all unless told
+  PART           services, connect, items, confirmed, latency, rate, nodes; all unless told
 ";

@@ -17,8 +17,11 @@ pub(crate) fn measure(cell: &Cell, runtime: &Runtime, most: usize) {
     );
     println!("| variables | server | first answer | in RAM | of a processor, idle |");
     println!("|---|---|---|---|---|");
-    for count in [1000, most / 10, most] {
-        ours(cell, runtime, count);
+    for count in [LEAST, most / 10, most] {
+        ours(cell, runtime, (count, History::Usual));
+        if count == LEAST {
+            ours(cell, runtime, (count, History::Off));
+        }
         // asyncua takes minutes for ten thousand nodes.
         for (start, most) in [(asyncua as Start, 1000), (node_opcua, 10_000)] {
             if count > most {
@@ -34,8 +37,28 @@ pub(crate) fn measure(cell: &Cell, runtime: &Runtime, most: usize) {
     }
 }
 
-fn ours(cell: &Cell, runtime: &Runtime, count: usize) {
-    let mapping = cell.file("nodes.yaml", &mapping(count));
+/// Whether the server keeps past values.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum History {
+    Usual,
+    Off,
+}
+
+impl History {
+    const fn server(self) -> &'static str {
+        match self {
+            Self::Usual => "ua-server",
+            Self::Off => "ua-server, no history",
+        }
+    }
+}
+
+fn ours(cell: &Cell, runtime: &Runtime, (count, history): (usize, History)) {
+    let mut text = mapping(count);
+    if history == History::Off {
+        text.push_str("server: {history: {values: 0}}\n");
+    }
+    let mapping = cell.file("nodes.yaml", &text);
     let began = Instant::now();
     let path = mapping.to_string_lossy();
     // `ua_server` expects the metrics page soon; this measurement waits for the endpoint.
@@ -50,13 +73,13 @@ fn ours(cell: &Cell, runtime: &Runtime, count: usize) {
     if !serves {
         let told = child.lines();
         let why = told.first().map_or("it ended", String::as_str);
-        println!("| {count} | ua-server | {why} | | |");
+        println!("| {count} | {} | {why} | | |", history.server());
         return;
     }
     let last = NodeId::new(namespace(count - 1), id(count - 1));
     let answer = runtime.block_on(answers(SERVER_ENDPOINT, last));
     assert_eq!(answer, StatusCode::BadWaitingForInitialData);
-    shown(count, "ua-server", began.elapsed(), child.id());
+    shown(count, history.server(), began.elapsed(), child.id());
     assert!(system_tests::metrics(METRICS_SERVER).is_some());
 }
 
@@ -115,6 +138,8 @@ fn id(number: usize) -> u32 {
     1 + u32::try_from(number % A_NAMESPACE).unwrap()
 }
 
+/// The smallest address space.
+const LEAST: usize = 1000;
 /// A DataSetWriterId has 16 bits.
 const A_NAMESPACE: usize = 50_000;
 type Start = fn(&Cell, usize, &str) -> Server;

@@ -1,9 +1,9 @@
-//! Reads, writes and calls, one at a time.
+//! Reads, browses, writes and calls, one at a time.
 
 use std::time::{Duration, Instant};
 
 use plant_opcua::client::{Browse, Client, SecurityChoice};
-use plant_opcua::types::{NodeId, ReferenceTypeId, Variant};
+use plant_opcua::types::{NodeId, ObjectId, ReferenceTypeId, Variant};
 use system_tests::{Cell, Times, per_message};
 
 use crate::servers::{METHOD, SPACE, Server, WRITTEN, connected, variable};
@@ -22,7 +22,7 @@ pub(crate) async fn measure(cell: &Cell, servers: &[Server], requests: usize) {
         for server in servers {
             asked.push(Asked::of(server, connected(cell, server.endpoint, security).await).await);
         }
-        for what in [What::ReadOne, What::ReadMany, What::Write, What::Call] {
+        for what in KINDS {
             kind(&mut asked, what, shown, requests).await;
         }
         for one in asked {
@@ -67,10 +67,19 @@ async fn kind(asked: &mut [Asked<'_>], what: What, security: &str, requests: usi
     }
 }
 
+const KINDS: [What; 5] = [
+    What::ReadOne,
+    What::ReadMany,
+    What::Browse,
+    What::Write,
+    What::Call,
+];
+
 #[derive(Clone, Copy)]
 enum What {
     ReadOne,
     ReadMany,
+    Browse,
     Write,
     Call,
 }
@@ -80,6 +89,7 @@ impl What {
         match self {
             Self::ReadOne => "read 1",
             Self::ReadMany => "read 100",
+            Self::Browse => "browse",
             Self::Write => "write 1",
             Self::Call => "call",
         }
@@ -124,6 +134,12 @@ impl<'a> Asked<'a> {
             What::ReadMany => {
                 let read = self.client.read(&self.nodes).await.unwrap();
                 assert_eq!(read.len(), MANY);
+            }
+            What::Browse => {
+                // The Server object has about the same references in all servers.
+                let node = ObjectId::Server.into();
+                let found = self.client.browse(&node, Browse::hierarchical()).await;
+                assert!(found.unwrap().len() > 5);
             }
             What::Write => {
                 let written = NodeId::new(SPACE, WRITTEN);
