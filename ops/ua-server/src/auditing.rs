@@ -87,14 +87,8 @@ pub(crate) fn came_in(login: &Login, server: &str) -> Audit {
         by: login.by,
         endpoint: login.endpoint.clone(),
     };
-    Audit {
-        action,
-        status: login.fault.map_or(StatusCode::Good, |fault| fault.status()),
-        user: Audit::named(&login.user),
-        session: None,
-        client_entry: String::new(),
-        server: server.to_owned(),
-    }
+    let status = login.fault.map_or(StatusCode::Good, |fault| fault.status());
+    Audit::without_session(action, status, &login.user, server)
 }
 
 /// Returns true if a value is small enough for an audit event.

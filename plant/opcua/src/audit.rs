@@ -155,6 +155,19 @@ impl Audit {
         }
     }
 
+    /// Creates the audit of an action without a session, such as the action of a user of the page.
+    #[must_use]
+    pub fn without_session(action: Action, status: StatusCode, user: &str, server: &str) -> Self {
+        Self {
+            action,
+            status,
+            user: Self::named(user),
+            session: None,
+            client_entry: String::new(),
+            server: server.to_owned(),
+        }
+    }
+
     /// Returns the name of a user in audits.
     #[must_use]
     pub fn named(user: &str) -> String {

@@ -90,14 +90,9 @@ impl Alarms {
             event: Some(event),
             comment: Some(comment),
         };
-        let audit = Audit {
-            action,
-            status: done.err().unwrap_or(StatusCode::Good),
-            user: Audit::named(user),
-            session: None,
-            client_entry: String::new(),
-            server: place.handle.info().application_uri.to_string(),
-        };
+        let status = done.err().unwrap_or(StatusCode::Good);
+        let server = place.handle.info().application_uri.as_ref();
+        let audit = Audit::without_session(action, status, user, server);
         audit.tell(place.handle.subscriptions());
         done
     }

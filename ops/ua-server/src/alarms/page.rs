@@ -91,15 +91,8 @@ impl Alarms {
             event: Some(event),
             comment: Some(comment),
         };
-        let audit = Audit {
-            action,
-            status: done.err().unwrap_or(StatusCode::Good),
-            user: Audit::named(user),
-            session: None,
-            client_entry: String::new(),
-            server: server.to_owned(),
-        };
-        audit.tell(subscriptions);
+        let status = done.err().unwrap_or(StatusCode::Good);
+        Audit::without_session(action, status, user, server).tell(subscriptions);
         done
     }
 }
