@@ -146,4 +146,28 @@ mod tests {
         assert!(!has(history, "/ACAlarm"));
         assert!(!has(Facets::default(), "/HistoricalRawData"));
     }
+
+    #[test]
+    fn the_page_of_conformance_lists_the_profiles() {
+        let facets = |is_secured| Facets {
+            is_secured,
+            has_history: true,
+            has_alarms: true,
+        };
+        let listed = |sessions, is_secured| {
+            let limits = limits::server(ClientLimits::of(sessions));
+            profiles(&limits, facets(is_secured))
+        };
+        let mut all = listed(50, true);
+        all.splice(1..1, [listed(49, true).remove(0), listed(50, false).remove(0)]);
+        let page = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/conformance.md");
+        let page = std::fs::read_to_string(page).unwrap();
+        let (_, table) = page.split_once("| URI | profile or facet |").unwrap();
+        let (table, _) = table.split_once("\n\n").unwrap();
+        let named = table.lines().filter_map(|line| {
+            let (name, _) = line.strip_prefix("| `")?.split_once('`')?;
+            Some(format!("http://opcfoundation.org/UA-Profile/Server/{name}"))
+        });
+        assert_eq!(named.collect::<Vec<_>>(), all);
+    }
 }
