@@ -3,10 +3,11 @@
 use std::time::Instant;
 
 use mappings::Publish;
-use uadp::{Array, BuiltinType, DecodeError, Fields, NetworkMessage, Scalar, Variant};
+use uadp::{Array, BuiltinType, DecodeError, Fields, Scalar, Variant};
 
+use crate::message::Encoded;
 use crate::output::PublisherKey;
-use crate::writer::{Encoded, MAX_KEPT};
+use crate::writer::MAX_KEPT;
 
 /// Holds back samples of a topic according to the rule of its variable.
 #[derive(Debug)]
@@ -62,7 +63,7 @@ impl Gate {
         latched_by: Option<PublisherKey>,
         now: Instant,
     ) -> (Passage, Option<Waiting>) {
-        let fields = block(sample).unwrap_or_default();
+        let fields = sample.fields().unwrap_or_default();
         let first =
             latched_by.is_some_and(|key| self.met.len() < MAX_KEPT && !self.met.contains(&key));
         if !first {
@@ -95,7 +96,7 @@ impl Gate {
     /// Returns the waiting sample for immediate publication, because no sample may follow it.
     pub(crate) fn hurry(&mut self, now: Instant) -> Option<Waiting> {
         let (sample, latched_by) = self.held.take()?;
-        self.say(block(&sample).unwrap_or_default(), latched_by, now);
+        self.say(sample.fields().unwrap_or_default(), latched_by, now);
         Some((sample, latched_by))
     }
 
@@ -140,14 +141,6 @@ impl Gate {
         let deadband = self.rule.deadband();
         deadband > 0.0 && within(&self.last, fields, deadband).unwrap_or(false)
     }
-}
-
-/// Returns the encoded fields of a sample.
-pub(crate) fn block(sample: &Encoded) -> Result<&[u8], DecodeError> {
-    let network = NetworkMessage::decode(&sample.bytes)?;
-    let message = network.messages().next().transpose()?;
-    let fields = message.map(|message| message.fields()).transpose()?;
-    Ok(fields.map(|fields| fields.bytes()).unwrap_or_default())
 }
 
 /// Returns whether all numbers differ by at most `deadband` and all other values are equal.

@@ -32,6 +32,7 @@ mod layout;
 mod learned;
 mod loop_rule;
 mod loss;
+mod message;
 mod network;
 mod output;
 mod pace;

@@ -10,7 +10,7 @@ use uadp::{
 
 use crate::counters::{Cause, Reason};
 use crate::fields;
-use crate::writer::Encoded;
+use crate::message::Encoded;
 
 /// Writes the NetworkMessage of a sample. The time of sending is patched in when the message is
 /// polled.

@@ -20,14 +20,18 @@ mod inquiries;
 mod late;
 mod local;
 mod metadata;
+mod muted;
 mod own;
 mod parts;
 mod reassembly;
 mod receive;
+mod redundancy_api;
 mod redundant;
 mod reload;
+mod roles;
 mod security;
 mod send;
+mod senders;
 mod told;
 mod values;
 
@@ -43,8 +47,8 @@ use self::announcements::Announcements;
 use self::calls::Calls;
 use self::reassembly::Reassembly;
 pub use self::redundant::MutedSamples;
-use self::redundant::RedundantSenders;
 use self::security::Security;
+use self::senders::RedundantSenders;
 use self::values::Values;
 use crate::confirm::Handover;
 use crate::counters::{Counters, Reason, Verdict};
@@ -210,7 +214,9 @@ impl Router {
 
     /// Repeats values, sends keep-alives, and detects silent topics that are due by `now`.
     pub fn handle_timeout(&mut self, now: Now) {
-        self.look_at_redundancy(now);
+        if self.values.redundant.is_some() {
+            self.roles().handle_timeout(now);
+        }
         self.look_at_part(now);
         while let Some(at) = self.values.next_due(now) {
             let topic = at.topic();
@@ -243,7 +249,7 @@ impl Router {
         let (_, _, silence) = self.values.periods();
         let claims = self.values.claims.due(silence);
         let keys = self.security.due();
-        let redundancy = self.redundancy_due();
+        let redundancy = self.values.redundant.as_ref().map(|of| of.due());
         let part = self.values.part.as_ref().map(|part| part.due());
         [
             timer,

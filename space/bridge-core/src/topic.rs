@@ -14,12 +14,13 @@ use crate::counters::Counters;
 use crate::description::Description;
 use crate::gate::Gate;
 use crate::loss::{Loss, Stop};
+use crate::message::{Encoded, Message};
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
 use crate::takes::Takes;
 use crate::transcoder::Transcoder;
-use crate::writer::{Encoded, Message, Writer};
+use crate::writer::Writer;
 
 /// A topic of the own space or of another space.
 #[derive(Debug)]

@@ -5,12 +5,12 @@ use mappings::{Overflow, TopicId};
 use super::about::About;
 use super::values::Values;
 use crate::counters::Reason;
+use crate::message::Encoded;
 use crate::network::join;
 use crate::output::Output;
 use crate::settings::Now;
 use crate::tap::Crossing;
 use crate::topics::Handle;
-use crate::writer::Encoded;
 
 impl Values {
     /// Returns the datagram of a sample, together with other waiting samples of its WriterGroup if

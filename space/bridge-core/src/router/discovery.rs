@@ -135,7 +135,7 @@ impl Router {
             // Another bridge of the space announces its own part, or what this program announces
             // when it is active.
         } else if space == own && (self.values.owned == Owned::All || self.values.is_source(from)) {
-            if !self.follow_peer(message, None, from, now) {
+            if !self.values.follow_peer(message, None, from, now) {
                 self.values.drop_own(None, from, now);
             }
         } else if message.is_chunk() && !message.is_sealed() {

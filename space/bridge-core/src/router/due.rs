@@ -9,12 +9,13 @@ use super::about::About;
 use super::values::Values;
 use crate::counters::Reason;
 use crate::loss::Reaction;
+use crate::message::Message;
 use crate::network::keep_alive;
 use crate::output::{Delivery, GOOD, Kept, Output};
 use crate::settings::{Local, Now};
 use crate::topic::{Item, Role};
 use crate::topics::Handle;
-use crate::writer::{Idle, Message};
+use crate::writer::Idle;
 
 impl Values {
     /// Repeats a value, sends a keep-alive, or detects the silence of a topic.

@@ -12,13 +12,14 @@ use crate::fields;
 use crate::gate::{Passage, Waiting};
 use crate::hops::Hop;
 use crate::loop_rule::{Side, What};
+use crate::message::{Encoded, Message};
 use crate::network::{check_size, data_set_header, encode};
 use crate::output::{Heard, PublisherKey};
 use crate::settings::{Local, Now};
 use crate::tap::Crossing;
 use crate::topic::{Item, Role, Topic};
 use crate::topics::Handle;
-use crate::writer::{Encoded, MAX_KEPT, Message};
+use crate::writer::MAX_KEPT;
 
 impl Values {
     /// Handles a sample of the local side.

@@ -60,7 +60,7 @@ impl Router {
     ) {
         self.sort_network_message(message, from, now);
         if self.values.redundant.is_some() {
-            self.note_clock(sent(&message.header()), from, now);
+            self.roles().note_clock(sent(&message.header()), from, now);
         }
     }
 
@@ -76,7 +76,7 @@ impl Router {
                 .count(About::sender(from), late::cause(case), 1, || detail);
         }
         if self.is_for_all(message, from, now)
-            || self.is_heartbeat(message, from, now)
+            || self.roles().is_heartbeat(message, from, now)
             || self.is_part(message, from, now)
         {
             return;
@@ -123,7 +123,7 @@ impl Router {
                     let about = About::sender(from);
                     self.values.count(about, cause, 1, || closed_to(from));
                 }
-                _ if self.follow_peer(message, namespace, from, now) => {}
+                _ if self.values.follow_peer(message, namespace, from, now) => {}
                 _ if is_request && is_muted => {
                     let cause = (Reason::Takeover, "standby");
                     self.values

@@ -4,13 +4,13 @@ use mappings::TopicId;
 
 use super::{About, Router, Values};
 use crate::counters::Reason;
+use crate::message::Message;
 use crate::network::chunk;
 use crate::output::Output;
 use crate::settings::{Link, Now};
 use crate::tap::Crossing;
 use crate::topic::{Item, Role, Sending};
 use crate::topics::Handle;
-use crate::writer::Message;
 
 impl Router {
     /// Returns the next output, topic by topic in turn. `None`: no output until the next
@@ -25,8 +25,8 @@ impl Router {
         self.check_lease(now);
         loop {
             let output = self.next_output(now)?;
-            if self.values.redundant.is_some() && self.mutes(&output) {
-                self.drop_muted(output);
+            if self.values.redundant.is_some() && self.values.mutes(&output) {
+                self.values.drop_muted(output);
                 continue;
             }
             if !self.security.is_on() {
@@ -37,7 +37,7 @@ impl Router {
                 return Some(output);
             }
             if is_heartbeat {
-                self.heartbeat_not_sealed(now);
+                self.roles().heartbeat_not_sealed(now);
             }
         }
     }

@@ -22,6 +22,7 @@ use crate::layout::Layout;
 use crate::learned::Learned;
 use crate::loop_rule::Owned;
 use crate::loss::{Loss, Stop, trigger};
+use crate::message::{Encoded, Message};
 use crate::output::{Delivery, Output};
 use crate::pace::Pace;
 use crate::part::OwnPart;
@@ -32,7 +33,6 @@ use crate::tap::Tap;
 use crate::topic::{Item, Role};
 use crate::topics::{Handle, Topics};
 use crate::transcoder::Transcoder;
-use crate::writer::{Encoded, Message};
 
 /// The topics of the space with their queues, turns and timers, and the outputs about them.
 #[derive(Debug)]

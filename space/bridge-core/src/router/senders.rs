@@ -6,15 +6,16 @@ use std::time::{Duration, Instant};
 
 use mappings::SpaceId;
 
+use super::about::About;
+use super::security::Security;
+use super::values::Values;
 use crate::counters::Reason;
 use crate::redundancy::Heartbeat;
-use crate::router::security::Security;
-use crate::router::{About, Values};
 use crate::settings::Now;
 
 /// The redundant bridges of other spaces.
 #[derive(Debug, Default)]
-pub(in crate::router) struct RedundantSenders {
+pub(super) struct RedundantSenders {
     of: BTreeMap<SpaceId, ActiveSender>,
 }
 
@@ -58,7 +59,7 @@ impl RedundantSenders {
 
     /// Returns whether a redundant bridge of another space sends values although another bridge of
     /// the space is active: its message was under way at the takeover. Counts it.
-    pub(in crate::router) fn is_superseded(
+    pub(super) fn is_superseded(
         &self,
         values: &mut Values,
         (space, from): (SpaceId, SocketAddr),
@@ -84,7 +85,7 @@ impl RedundantSenders {
 
     /// Returns whether the sender is known to be the active bridge of another space, because its
     /// heartbeat was secured as its message is.
-    pub(in crate::router) fn is_active(
+    pub(super) fn is_active(
         &self,
         security: &Security,
         (space, from): (SpaceId, SocketAddr),

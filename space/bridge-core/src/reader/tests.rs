@@ -1,0 +1,315 @@
+//! Unit tests of `reader`.
+
+use super::*;
+
+fn address(port: u16) -> SocketAddr {
+    ([127, 0, 0, 1], port).into()
+}
+
+fn place(sequence: u16, stamp: i128) -> Place {
+    Place {
+        sequence: Some(sequence),
+        stamp: Some(Timestamp::from_unix_nanos(stamp)),
+        fine: true,
+        sent: None,
+        from: address(1),
+        held_back: Duration::ZERO,
+        by_clients: false,
+    }
+}
+
+/// Admits a message for [`Handling::Shown`].
+fn admit(reader: &mut Reader, place: Place, now: Instant) -> Result<(u16, Kept), Reason> {
+    let admitted = reader.admit(place, None, Handling::Shown, now)?;
+    Ok((admitted.missing, admitted.kept))
+}
+
+#[expect(
+    clippy::disallowed_methods,
+    reason = "a test needs some instant to count from"
+)]
+fn reader() -> (Reader, Instant) {
+    let now = Instant::now();
+    (Reader::new(Some(address(1)), now), now)
+}
+
+#[test]
+fn numbers_wrap_and_gaps_are_counted() {
+    let (mut reader, now) = reader();
+    assert_eq!(
+        admit(&mut reader, place(65_534, 1000), now),
+        Ok((0, Kept::Alone))
+    );
+    assert_eq!(
+        admit(&mut reader, place(65_535, 2000), now),
+        Ok((0, Kept::Alone))
+    );
+    assert_eq!(
+        admit(&mut reader, place(2, 3000), now),
+        Ok((2, Kept::Alone)),
+        "0 and 1 are missing"
+    );
+}
+
+#[test]
+fn old_and_equal_numbers_are_dropped_unless_the_writer_started_over() {
+    let (mut reader, now) = reader();
+    assert_eq!(hear(&mut reader, 500, 9000, now), Ok(Kept::Alone));
+    assert_eq!(
+        admit(&mut reader, place(500, 9000), now),
+        Err(Reason::Repeat),
+        "sent again under its number"
+    );
+    assert_eq!(
+        admit(&mut reader, place(499, 8000), now),
+        Err(Reason::Stale)
+    );
+    assert_eq!(
+        admit(&mut reader, place(0, 10_000), now),
+        Ok((0, Kept::Alone)),
+        "a newer stamp tells of a restart"
+    );
+    let moved = Place {
+        from: address(2),
+        ..place(0, 10_000)
+    };
+    assert_eq!(
+        admit(&mut reader, moved, now),
+        Ok((0, Kept::Alone)),
+        "another address tells of a restart"
+    );
+}
+
+#[test]
+fn a_datagram_that_comes_after_the_end_of_its_writer_is_handed_on_once() {
+    for handling in [Handling::Event, Handling::AsSource, Handling::Shown] {
+        let (mut reader, now) = reader();
+        let admit = |reader: &mut Reader, place: Place| {
+            let admitted = reader.admit(place, None, handling, now)?;
+            reader.delivered(place.instance(), (admitted.kept, admitted.lasting), now);
+            Ok(admitted.kept)
+        };
+        assert_eq!(admit(&mut reader, place(7, 1000)), Ok(Kept::Alone));
+        assert_eq!(admit(&mut reader, place(8, 2000)), Ok(Kept::Alone));
+        assert!(reader.leave());
+        // Both datagrams were delayed by the network.
+        assert_eq!(admit(&mut reader, place(7, 1000)), Err(Reason::Stale));
+        assert_eq!(admit(&mut reader, place(8, 2000)), Err(Reason::Repeat));
+        // The next writer starts with a clock that was set back.
+        assert_eq!(admit(&mut reader, place(0, 500)).err(), None);
+    }
+}
+
+#[test]
+fn a_repeated_key_frame_is_known_by_its_stamp() {
+    let (mut reader, now) = reader();
+    let first = place(1, 1000);
+    assert_eq!(admit(&mut reader, first, now), Ok((0, Kept::Alone)));
+    reader.delivered(first.instance(), (Kept::Alone, false), now);
+    assert_eq!(admit(&mut reader, place(2, 1000), now), Err(Reason::Repeat));
+    assert_eq!(
+        admit(&mut reader, place(3, 2000), now),
+        Ok((0, Kept::Alone)),
+        "another sample"
+    );
+    let (mut coarse, now) = self::reader();
+    let stamp_without_picoseconds = Place {
+        fine: false,
+        ..place(1, 1000)
+    };
+    assert_eq!(
+        admit(&mut coarse, stamp_without_picoseconds, now),
+        Ok((0, Kept::Alone))
+    );
+    coarse.delivered(
+        stamp_without_picoseconds.instance(),
+        (Kept::Alone, false),
+        now,
+    );
+    let next = Place {
+        sequence: Some(2),
+        ..stamp_without_picoseconds
+    };
+    assert_eq!(
+        admit(&mut coarse, next, now),
+        Ok((0, Kept::Alone)),
+        "a coarse stamp may be shared by two samples"
+    );
+}
+
+const PERIOD: Duration = Duration::from_secs(1);
+
+/// Admits and delivers a key frame as the Router does.
+fn hear(reader: &mut Reader, sequence: u16, stamp: i128, now: Instant) -> Result<Kept, Reason> {
+    let place = place(sequence, stamp);
+    let (_, kept) = admit(reader, place, now)?;
+    reader.delivered(place.instance(), (kept, false), now);
+    Ok(kept)
+}
+
+#[test]
+fn of_several_values_repeated_side_by_side_each_is_handed_on_once() {
+    let (mut reader, start) = reader();
+    let first: Vec<_> = [1000, 2000, 3000]
+        .into_iter()
+        .zip(1..)
+        .map(|(stamp, sequence)| hear(&mut reader, sequence, stamp, start))
+        .collect();
+    assert_eq!(first, [Ok(Kept::Alone); 3]);
+    let mut round = |turn: u16| -> Vec<_> {
+        let now = start + PERIOD * u32::from(turn);
+        [1000, 2000, 3000]
+            .into_iter()
+            .zip(turn * 3 + 1..)
+            .map(|(stamp, sequence)| hear(&mut reader, sequence, stamp, now))
+            .collect()
+    };
+    let kept_again = [Ok(Kept::Again), Ok(Kept::Again), Err(Reason::Repeat)];
+    assert_eq!(
+        round(1),
+        kept_again,
+        "the older ones were not given up after all"
+    );
+    for turn in 2..20 {
+        assert_eq!(round(turn), [Err(Reason::Repeat); 3]);
+    }
+}
+
+#[test]
+fn who_comes_late_gets_all_values_wherever_in_the_round_it_begins() {
+    let (mut reader, now) = reader();
+    let heard: Vec<_> = [2000, 3000, 1000, 2000, 3000, 1000]
+        .into_iter()
+        .zip(7..)
+        .map(|(stamp, sequence)| hear(&mut reader, sequence, stamp, now))
+        .collect();
+    let repeat = Err(Reason::Repeat);
+    let expected = [
+        Ok(Kept::Alone),
+        Ok(Kept::Alone),
+        Ok(Kept::Beside),
+        Ok(Kept::Again),
+        repeat,
+        repeat,
+    ];
+    assert_eq!(heard, expected);
+}
+
+#[test]
+fn a_value_that_is_no_longer_repeated_is_retired_and_one_value_is_a_state_again() {
+    let (mut reader, start) = reader();
+    let mut sequence = 0;
+    let mut retired = Vec::new();
+    for turn in 0..12_u32 {
+        let now = start + PERIOD * turn;
+        // From turn 4 an update replaces the first value; from turn 8 the second value is not
+        // repeated.
+        let first = if turn < 4 { 1000 } else { 3000 };
+        for stamp in [first, 2000].into_iter().filter(|s| turn < 8 || *s != 2000) {
+            sequence += 1;
+            let _what = hear(&mut reader, sequence, stamp, now);
+            while let Some(gone) = reader.retire(now, PERIOD * 3) {
+                retired.push((turn, gone.unix_nanos()));
+            }
+        }
+    }
+    assert_eq!(retired, [(6, 1000), (10, 2000)]);
+    let next = hear(&mut reader, sequence + 1, 4000, start + PERIOD * 12);
+    assert_eq!(next, Ok(Kept::Alone));
+}
+
+#[test]
+fn a_clock_that_is_set_back_makes_no_older_value_of_a_newer_one() {
+    let (mut reader, now) = reader();
+    let sent_at = |sequence, stamp: i128, sent: i128| Place {
+        sent: Some(Timestamp::from_unix_nanos(sent)),
+        ..place(sequence, stamp)
+    };
+    let (second, soon) = (1_000_000_000, 50_000);
+    let mut hear = |place: Place| {
+        let (_, kept) = admit(&mut reader, place, now)?;
+        reader.delivered(place.instance(), (kept, false), now);
+        Ok(kept)
+    };
+    let first = hear(sent_at(1, 1000 * second, 1000 * second + soon));
+    assert_eq!(first, Ok(Kept::Alone));
+    let set_back = hear(sent_at(2, 900 * second, 900 * second + soon));
+    assert_eq!(set_back, Ok(Kept::Alone));
+    let next = hear(sent_at(3, 901 * second, 901 * second + soon));
+    assert_eq!(next, Ok(Kept::Alone));
+    let repeated = hear(sent_at(4, 901 * second, 902 * second));
+    assert_eq!(repeated, Err(Reason::Repeat));
+    // A sample that was taken earlier and sent later is another value, as for several latched
+    // publishers.
+    let beside = hear(sent_at(5, 890 * second, 903 * second));
+    assert_eq!(beside, Ok(Kept::Beside));
+}
+
+#[test]
+fn nothing_is_retired_while_the_writer_says_nothing_at_all() {
+    let (mut reader, start) = reader();
+    for (sequence, stamp) in (0..).zip([1000, 2000, 1000, 2000]) {
+        let _what = hear(&mut reader, sequence, stamp, start);
+    }
+    let later = start + PERIOD * 60;
+    assert_eq!(hear(&mut reader, 4, 1000, later), Err(Reason::Repeat));
+    let gone = reader.retire(later, PERIOD * 3);
+    assert_eq!(gone.map(Timestamp::unix_nanos), Some(2000));
+    assert_eq!(reader.retire(later, PERIOD * 3), None);
+}
+
+#[test]
+fn a_fast_topic_beside_a_latched_value_does_not_push_that_out() {
+    let (mut reader, now) = reader();
+    let mut sequence = 0_u16;
+    let mut stamp = 1000;
+    let mut heard_anew = 0;
+    for turn in 0..2000 {
+        sequence += 1;
+        if turn % 100 == 0 {
+            let of_latched = hear(&mut reader, sequence, 1000, now);
+            heard_anew += usize::from(of_latched != Err(Reason::Repeat));
+        } else {
+            stamp += 1;
+            assert!(hear(&mut reader, sequence, stamp, now).is_ok());
+        }
+    }
+    // Delivered first, and again when it turns out to be one of several values.
+    assert!(heard_anew <= 2, "{heard_anew}");
+}
+
+#[test]
+fn silence_is_told_once_and_ends_with_the_next_message() {
+    let (mut reader, start) = reader();
+    let timeout = Duration::from_secs(3);
+    let early = start + Duration::from_millis(2999);
+    assert!(!reader.fell_silent(early, timeout));
+    assert!(reader.fell_silent(start + timeout, timeout));
+    assert!(!reader.fell_silent(start + timeout * 2, timeout));
+    assert_eq!(reader.due(timeout), None);
+    assert!(reader.lives(start + timeout * 3));
+    assert!(!reader.lives(start + timeout * 3));
+    assert!(reader.fell_silent(start + timeout * 4, timeout));
+    assert_eq!(reader.loss(), None);
+}
+
+#[test]
+fn who_only_repeats_itself_on_two_ways_lives_and_who_is_not_understood_does_not() {
+    let (mut reader, start) = reader();
+    let timeout = Duration::from_secs(3);
+    reader.dropped(Reason::Duplicate);
+    assert!(!reader.lives(start + timeout), "it never was silent");
+    assert!(!reader.fell_silent(start + timeout, timeout));
+    reader.dropped(Reason::Overflow);
+    assert!(!reader.lives(start + timeout * 2));
+    assert!(!reader.fell_silent(start + timeout * 2, timeout));
+    reader.dropped(Reason::Mismatch);
+    reader.dropped(Reason::Duplicate);
+    reader.heard(start + timeout * 3);
+    assert!(!reader.lives(start + timeout * 3));
+    assert!(reader.fell_silent(start + timeout * 3, timeout));
+    assert_eq!(reader.loss(), Some(Reason::Mismatch));
+    assert!(!reader.lives(start + timeout * 4));
+    assert!(!reader.may_be(address(2), start + timeout * 4, timeout * 2));
+    assert!(reader.is_good(start + timeout * 4));
+}
