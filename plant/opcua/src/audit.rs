@@ -180,6 +180,13 @@ impl Audit {
     /// Logs the audit and sends its event to the subscribers of the Server object.
     pub fn tell(self, subscriptions: &SubscriptionCache) {
         self.log();
+        let mut notifier = subscriptions.event_notifier();
+        let has_subscriber = notifier.notify_for(ObjectId::Server).is_some();
+        drop(notifier);
+        if !has_subscriber {
+            // Composing the event would be a large part of the time of a write.
+            return;
+        }
         let told = Told::new(self);
         let server: NodeId = ObjectId::Server.into();
         subscriptions.notify_events([(&told as &dyn Event, &server)].into_iter());
