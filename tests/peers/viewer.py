@@ -1,5 +1,5 @@
 """A viewer of the Foxglove WebSocket protocol: subscribes to all channels and prints the first
-value of each as a JSON line."""
+value of each as a JSON line, and a file of the robot's model if one is named."""
 
 import argparse
 import asyncio
@@ -30,6 +30,9 @@ async def watch(args):
                     wanted = [{"id": 1000 + number, "channelId": number} for number in new]
                     await socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
                 continue
+            if frame[0] == 4:
+                lifetime.say(**asset(frame))
+                return
             opcode, subscription, time = struct.unpack_from("<BIQ", frame)
             channel = channels[subscription - 1000]
             if opcode != 1 or channel["topic"] in seen:
@@ -38,7 +41,15 @@ async def watch(args):
             lifetime.say(topic=channel["topic"], encoding=channel["encoding"], time=time,
                          schema=channel["schemaName"], value=decoded(channel, frame[13:]))
             if len(seen) == args.topics:
-                return
+                if args.asset is None:
+                    return
+                await socket.send(json.dumps({"op": "fetchAsset", "uri": args.asset, "requestId": 9}))
+
+
+def asset(frame):
+    opcode, request, status, length = struct.unpack_from("<BIBI", frame)
+    return {"request": request, "status": status, "error": frame[10:10 + length].decode(),
+            "data": frame[10 + length:].decode("latin-1")}
 
 
 def decoded(channel, data):
@@ -54,6 +65,7 @@ def main():
     parser.add_argument("url")
     parser.add_argument("--protocol", default="foxglove.sdk.v1")
     parser.add_argument("--topics", type=int, default=1, help="end after a value of this many topics")
+    parser.add_argument("--asset", help="fetch this file after the values")
     parser.add_argument("--limit", type=float, default=60.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)

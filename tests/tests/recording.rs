@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, Started, UaSide, eventually, holds_for, program};
+use system_tests::{Cell, Child, MASTER, Peer, Started, UaSide, eventually, holds_for, program};
 use uadp::Scalar;
 
 const SOON: Duration = Duration::from_secs(30);
@@ -269,4 +269,114 @@ fn viewers_see_the_values_as_ros_messages_by_both_protocols() {
     holds_for("the server runs on", Duration::from_millis(300), || {
         live.runs()
     });
+}
+
+const URDF: &str = r#"<robot name="arm"><link name="base"><visual><geometry><mesh filename="package://arm_description/meshes/base.stl"/></geometry></visual></link></robot>"#;
+const MESH: &str = "package://arm_description/meshes/base.stl";
+const ROBOTS: &str = "spaces: [{id: 1}, {id: 2}]
+namespaces: {2: urn:test:robots}
+variables:
+  - {node: ns=2;i=20, name: Arm.Transforms, origin: 1, ros: {topic: /tf, type: tf2_msgs/TFMessage}}
+  - {node: ns=2;i=21, name: Arm.Fixed, origin: 1, ros: {topic: /tf_static, type: tf2_msgs/TFMessage}}
+  - {node: ns=2;i=22, name: Base.Model, origin: 2, ros: {topic: /robot_description, type: std_msgs/String}}
+";
+
+/// Returns a transform from the world to a frame, as rospy and viewers have it.
+fn transform(frame: &str, x: f64) -> Value {
+    json!({"transforms": [{
+        "header": {"frame_id": "world"}, "child_frame_id": frame,
+        "transform": {"translation": {"x": x, "y": 0.0, "z": 0.25},
+                      "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}}]})
+}
+
+/// Checks the transforms and models that a viewer or the reader of a recording decoded.
+fn check_robots(seen: &[Value], value: &str) {
+    let of = |topic: &str| seen.iter().find(|line| line["topic"] == topic);
+    for (topic, frame, x) in [("/tf", "tool", 1.5), ("/tf_static", "base", -0.5)] {
+        let line = of(topic).unwrap_or(&Value::Null);
+        assert_eq!(line["schema"], "tf2_msgs/msg/TFMessage", "{seen:?}");
+        let transform = &line[value]["transforms"][0];
+        assert_eq!(transform["header"]["frame_id"], "world", "{line}");
+        assert_eq!(transform["child_frame_id"], frame, "{line}");
+        let translation = &transform["transform"]["translation"];
+        assert_eq!(translation["x"], x, "{line}");
+    }
+    for (topic, text) in [("/robot_description", "<robot/>"), ("/arm/model", URDF)] {
+        let line = of(topic).unwrap_or(&Value::Null);
+        assert_eq!(line["schema"], "std_msgs/msg/String", "{seen:?}");
+        assert_eq!(line[value]["data"], text, "{line}");
+    }
+}
+
+/// Starts the nodes of both ROS that publish transforms and the model of a robot.
+fn robots(cell: &Cell) -> [Child; 3] {
+    let tf = "tf2_msgs/TFMessage";
+    let (moving, fixed) = (transform("tool", 1.5), transform("base", -0.5));
+    let (moving, fixed) = (moving.to_string(), fixed.to_string());
+    let words = [
+        "/tf", tf, "--node", "tf", "--repeat", "0", "--value", &moving,
+    ];
+    let moving = cell.rospy("ros1_pub.py", &words);
+    let words = [
+        "/tf_static",
+        tf,
+        "--node",
+        "fixed",
+        "--latch",
+        "--value",
+        &fixed,
+    ];
+    let fixed = cell.rospy("ros1_pub.py", &words);
+    let kept = ["--durability", "transient_local", "--depth", "1"];
+    let words = ["/robot_description", "std_msgs/String", "--domain", "2"];
+    let value = ["--value", "\"<robot/>\""];
+    let words = [&words[..], &value, &kept].concat();
+    let model = cell.cyclone("ros2_pub.py", &words);
+    listed(&[
+        ("ua_1_2_20", tf),
+        ("ua_1_2_21", tf),
+        ("ua_2_2_22", "std_msgs/String"),
+    ]);
+    [moving, fixed, model]
+}
+
+#[test]
+fn viewers_and_recordings_have_the_transforms_and_models_of_both_ros() {
+    let peers = [Peer::Ros1, Peer::Python];
+    let Some(cell) = Cell::with(&peers) else {
+        return;
+    };
+    let package = cell.folder().join("prefix/share/arm_description");
+    std::fs::create_dir_all(package.join("meshes")).unwrap();
+    std::fs::write(package.join("meshes/base.stl"), "solid base").unwrap();
+    let mapping = cell.file("robots.yaml", ROBOTS);
+    let mapping = text(&mapping);
+    let _master = cell.roscore();
+    let set = ["set", "/arm/robot_description", URDF];
+    let mut set = cell.ros1_started("bin/rosparam", &set).start();
+    assert!(set.wait_for_end(SOON).success(), "{set}");
+    let _bridges = (cell.bridge_ros1(&[mapping]), cell.bridge_ros2(&[mapping]));
+    let _robots = robots(&cell);
+
+    // Viewers and recordings that start after the fixed transforms and the models were published.
+    let model = format!("/arm/model=http://{MASTER}/arm/robot_description");
+    let with_model = ["--model", &model];
+    let words = ["live", "--port", "8767"];
+    let mut live = ua_space(&[&words[..], &with_model].concat())
+        .env("AMENT_PREFIX_PATH", cell.folder().join("prefix"))
+        .start();
+    live.wait_for_line("ws://127.0.0.1:8767", SOON);
+    let words = ["ws://127.0.0.1:8767", "--topics", "4", "--asset", MESH];
+    let seen = cell.asyncua_once("viewer.py", &words);
+    assert_eq!(seen[0]["capabilities"], json!(["assets"]), "{seen:?}");
+    check_robots(&seen, "value");
+    let mesh = json!({"request": 9, "status": 0, "error": "", "data": "solid base"});
+    assert_eq!(seen.last(), Some(&mesh), "{seen:?}");
+
+    let values = cell.folder().join("robots.mcap");
+    let words = ["record", text(&values), "--for", "5"];
+    let (code, recorded) = ended(&[&words[..], &with_model].concat());
+    assert_eq!(code, 0, "{recorded}");
+    let judged = cell.asyncua_once("mcap_judge.py", &[text(&values)]);
+    check_robots(&judged, "first");
 }

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use thiserror::Error;
 use tokio::sync::watch;
 
-use crate::master::MasterError;
+use crate::master::{Master, MasterError};
 use crate::names::NameError;
 use crate::node::Inner;
 use crate::xmlrpc::Value;
@@ -43,7 +43,21 @@ impl Parameters {
     /// not set.
     pub async fn get(&self, name: &str) -> Result<Option<ParamValue>, ParamError> {
         let name = self.node.parameter_name(name)?;
-        Ok(read(&self.node, &name).await?)
+        Ok(read(&self.node.master, &name).await?)
+    }
+
+    /// Reads a parameter, or a namespace as a map, from the master at `uri` (`http://host:port`)
+    /// without registering a node; `None` if it is not set. `name` is its full name. Takes at most
+    /// 3 s.
+    ///
+    /// # Errors
+    /// Fails if the URI is invalid, or if the master cannot be reached or violates the API.
+    pub async fn of_master(
+        uri: &str,
+        caller_id: &str,
+        name: &str,
+    ) -> Result<Option<ParamValue>, MasterError> {
+        read(&Master::at(uri, caller_id)?, name).await
     }
 
     /// Sets a parameter. A map replaces all members of the namespace.
@@ -199,8 +213,8 @@ pub enum ParamError {
 }
 
 /// Reads a parameter from the master by its full name.
-async fn read(node: &Inner, name: &str) -> Result<Option<ParamValue>, MasterError> {
-    match node.master.call("getParam", vec![name.into()]).await {
+async fn read(master: &Master, name: &str) -> Result<Option<ParamValue>, MasterError> {
+    match master.call("getParam", vec![name.into()]).await {
         Ok(value) => known("getParam", value).map(Some),
         Err(MasterError::Refused { .. }) => Ok(None),
         Err(error) => Err(error),

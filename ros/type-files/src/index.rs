@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use messages::{Dialect, TextKind, TypeName};
 
@@ -170,6 +170,29 @@ impl<'s> Walk<'s> {
         found
     }
 
+    /// Returns the folder of the package `name` at or below a folder.
+    pub(crate) fn package_named(
+        &mut self,
+        name: &str,
+        folder: &Path,
+        depth: usize,
+    ) -> Option<PathBuf> {
+        let entries = self.entries(folder)?;
+        if entries.iter().any(|entry| entry.ends_with(MANIFEST)) {
+            let package = self.package(folder);
+            return (package.name == name).then(|| folder.to_owned());
+        }
+        if ignored(Dialect::Ros1)
+            .iter()
+            .any(|marker| entries.iter().any(|entry| entry.ends_with(marker)))
+        {
+            return None;
+        }
+        let depth = depth.checked_sub(1)?;
+        let mut folders = entries.iter().filter(|entry| is_real_folder(entry));
+        folders.find_map(|entry| self.package_named(name, entry, depth))
+    }
+
     /// Walks a folder. `only`: the only ROS version for which the folder counts.
     fn walk(
         &mut self,
@@ -281,6 +304,17 @@ impl<'s> Walk<'s> {
                 None
             }
         }
+    }
+}
+
+/// Returns the folder with this name in a folder. The name is no path.
+pub(crate) fn entry(folder: &Path, name: &str) -> Option<PathBuf> {
+    let mut parts = Path::new(name).components();
+    match (parts.next(), parts.next()) {
+        (Some(Component::Normal(_)), None) => {
+            Some(folder.join(name)).filter(|found| found.is_dir())
+        }
+        _ => None,
     }
 }
 

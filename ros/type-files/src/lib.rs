@@ -53,6 +53,26 @@ impl Environment {
             ros2: list(AMENT_PREFIX_PATH),
         }
     }
+
+    /// Returns whether no ROS installation is known.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.ros1.is_empty() && self.ros2.is_empty()
+    }
+
+    /// Returns the folder of a package; `None` if it is not installed. Reads the folders of
+    /// `ROS_PACKAGE_PATH`.
+    #[must_use]
+    pub fn package(&self, name: &str) -> Option<PathBuf> {
+        let mut shared = self.ros2.iter().map(|prefix| prefix.join("share"));
+        if let Some(folder) = shared.find_map(|share| index::entry(&share, name)) {
+            return Some(folder);
+        }
+        let mut unseen = |_: &Path| {};
+        let mut walk = Walk::new(&mut unseen);
+        let mut roots = self.ros1.iter();
+        roots.find_map(|root| walk.package_named(name, root, DEEPEST))
+    }
 }
 
 /// The surroundings of a mapping on this host: files, definitions, and the environment of this

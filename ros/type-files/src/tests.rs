@@ -532,3 +532,31 @@ fn files_are_read_within_their_bound() {
         "it is larger than 8 MiB"
     );
 }
+
+#[test]
+fn packages_are_found_by_the_name_in_their_manifest_and_names_are_no_paths() {
+    let manifest = "<package><name>arm_description</name></package>";
+    let folder = Folder::new(
+        "packages",
+        &[
+            ("ws/src/repo/arm/package.xml", manifest),
+            ("ws/src/repo/arm/nested/package.xml", "<name>nested</name>"),
+            ("ws/src/off/CATKIN_IGNORE", ""),
+            ("ws/src/off/hidden/package.xml", "<name>hidden</name>"),
+            ("prefix/share/base_description/package.xml", ""),
+        ],
+    );
+    let environment = Environment {
+        ros1: vec![folder.path("ws/src")],
+        ros2: vec![folder.path("prefix")],
+    };
+    assert!(!environment.is_empty() && Environment::default().is_empty());
+    let found = |name: &str| environment.package(name);
+    let arm = folder.path("ws/src/repo/arm");
+    assert_eq!(found("arm_description"), Some(arm));
+    let base = folder.path("prefix/share/base_description");
+    assert_eq!(found("base_description"), Some(base));
+    for missing in ["arm", "nested", "hidden", "", ".", "..", "../share", "/"] {
+        assert_eq!(found(missing), None, "{missing}");
+    }
+}

@@ -7,6 +7,18 @@ use clap::Args;
 use mappings::SpaceId;
 
 use super::live::{Group, seconds};
+use crate::live::ModelSource;
+
+/// The models of robots that viewers show.
+#[derive(Debug, Args)]
+pub(crate) struct Models {
+    /// The model (URDF) of a robot for viewers: a file, or a ROS 1 master with the parameter
+    /// robot_description, as http://localhost:11311 or
+    /// http://localhost:11311/arm/robot_description. The topic is /robot_description, the name of
+    /// the parameter, or TOPIC. May be repeated
+    #[arg(long, value_name = "[TOPIC=]FILE|URL")]
+    pub(crate) model: Vec<ModelSource>,
+}
 
 #[derive(Debug, Args)]
 pub(crate) struct Record {
@@ -25,6 +37,8 @@ pub(crate) struct Record {
     /// Print the summary as a JSON object
     #[arg(long)]
     pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) models: Models,
     #[command(flatten)]
     pub(crate) group: Group,
 }
@@ -68,6 +82,8 @@ pub(crate) struct Viewers {
     /// repeated
     #[arg(long, value_name = "ORIGIN")]
     pub(crate) origin: Vec<String>,
+    #[command(flatten)]
+    pub(crate) models: Models,
     /// End after this time. Without it: at Ctrl-C
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) seconds: Option<f64>,

@@ -14,12 +14,13 @@ use uadp::{BuiltinType, DataSetMessage, MessageKind, Scalar, Variant};
 
 use super::described::{Described, Field, What, is_integer};
 use super::plain;
+use super::robot::{self, Model};
 
 /// The channels of all topics with values. A topic with a new description gets a new channel.
 pub(super) struct Channels {
     topics: BTreeMap<TopicId, Slot>,
-    /// The names of the channels, and the topics that use them.
-    names: BTreeMap<String, TopicId>,
+    /// The names of the channels, and the topics that use them. Models of robots have no topic.
+    names: BTreeMap<String, Option<TopicId>>,
     ros1: Definitions,
     ros2: Definitions,
     /// The id of the last channel.
@@ -135,6 +136,28 @@ impl Channels {
         Ok(channel)
     }
 
+    /// Makes the channel of the model of a robot.
+    ///
+    /// # Errors
+    /// [`Unfit`] if there is no channel, or the type of its message is not known.
+    pub(super) fn of_model(&mut self, model: &Model) -> Result<Arc<Channel>, Unfit> {
+        let name: TypeName = robot::TYPE.parse().map_err(|_| Unfit::Mismatch)?;
+        let message = self.ros2.find(&name).map_err(|_| Unfit::Mismatch)?;
+        self.last = self.last.checked_add(1).ok_or(Unfit::Channels)?;
+        self.names.insert(model.topic.clone(), None);
+        Ok(Arc::new(Channel {
+            id: self.last,
+            name: model.topic.clone(),
+            encoding: "cdr",
+            schema_name: name.ros2(),
+            schema_encoding: "ros2msg",
+            schema: message.definition().to_owned(),
+            metadata: BTreeMap::new(),
+            form: Form::Bytes,
+            described: None,
+        }))
+    }
+
     /// Returns the ROS types that are recorded as JSON because their definitions are missing or
     /// differ.
     pub(super) const fn unknown(&self) -> &BTreeSet<String> {
@@ -228,8 +251,8 @@ impl Channels {
             name.filter(|name| !name.is_empty())
         };
         let wanted = ros.or_else(named).unwrap_or_else(|| format!("/{id}"));
-        let owner = *self.names.entry(wanted.clone()).or_insert(topic);
-        match owner == topic {
+        let owner = *self.names.entry(wanted.clone()).or_insert(Some(topic));
+        match owner == Some(topic) {
             true => wanted,
             false => format!("{wanted}@{id}"),
         }

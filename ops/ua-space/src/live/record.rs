@@ -33,10 +33,26 @@ use crate::report::warn;
 /// Runs `ua-space record`.
 pub(crate) fn record(arguments: &Record) -> Result<(), Failure> {
     let format = Format::of(&arguments.file)?;
+    if format == Format::PcapNg && !arguments.models.model.is_empty() {
+        return Err(Failure::Usage(
+            "--model is for recordings that viewers open: name the file .mcap".to_owned(),
+        ));
+    }
     // The drops of the socket are reported as lost messages.
     in_group_with_own(&arguments.group, async |mut live| {
         live.want_calls(FIRST_ASKED);
+        // A model that cannot be read leaves no file.
+        let mut models = Vec::new();
+        for source in &arguments.models.model {
+            models.push(source.load().await?);
+        }
         let mut recording = Recording::new(format, &arguments.file, &live)?;
+        let start = live.utc(live.now());
+        if let Form::Values(values) = &mut recording.form {
+            for model in &models {
+                values.add_model(model, start);
+            }
+        }
         let ended = recording.run(&mut live, arguments).await;
         let now = live.now();
         let time = live.utc(now);

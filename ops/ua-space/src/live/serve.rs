@@ -2,8 +2,9 @@
 //! WebSocket protocol. Viewers only read.
 //!
 //! Reading order: this module (values from the group), `hub` (channels and clients), `client` (one
-//! connection).
+//! connection), `assets` (meshes of robots).
 
+mod assets;
 mod client;
 mod hub;
 
@@ -12,11 +13,14 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bridge_node::Environment;
 use tokio::net::TcpListener;
 
+use self::assets::Assets;
 use self::hub::{Hub, Publication};
 use super::book::{Kind, News};
 use super::channels::{Channels, Unfit, is_value};
+use super::robot::Model;
 use super::{Go, in_group, until, utc};
 use crate::arguments::Viewers;
 use crate::exit::Failure;
@@ -37,15 +41,20 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
                 "every host that reaches {address} sees all values, without sign-in"
             ));
         }
-        let hub = Arc::new(Hub::new(live.group()));
+        let assets = Assets::new(Environment::from_env());
+        let hub = Arc::new(Hub::new(live.group(), assets));
+        let start = live.start_utc();
+        let mut channels = Channels::new();
+        for source in &arguments.models.model {
+            let model = source.load().await?;
+            offer(&model, (&mut channels, &hub), utc(start, live.now()));
+        }
         let accepting = tokio::spawn(client::accept(
             listener,
             Arc::clone(&hub),
             arguments.origin.clone().into(),
         ));
         writeln!(io::stdout(), "{} at ws://{address}", live.group())?;
-        let mut channels = Channels::new();
-        let start = live.start_utc();
         let end = until(live.now(), arguments.seconds);
         let mut each = |news: News<'_>, now: Duration| {
             take(&news, (&mut channels, &hub), (start, now));
@@ -66,6 +75,17 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
     })
 }
 
+/// Offers the model of a robot, which does not change.
+fn offer(model: &Model, (channels, hub): (&mut Channels, &Hub), now: i128) {
+    match channels.of_model(model) {
+        Ok(channel) => {
+            let time = u64::try_from(now).unwrap_or_default();
+            hub.keep(&channel, (time, model.data.clone()));
+        }
+        Err(unfit) => hub.leave_out(unfit),
+    }
+}
+
 /// Handles a value or description of the group.
 fn take(news: &News<'_>, (channels, hub): (&mut Channels, &Hub), (start, now): (i128, Duration)) {
     let (topic, described) = match news {
@@ -83,7 +103,7 @@ fn take(news: &News<'_>, (channels, hub): (&mut Channels, &Hub), (start, now): (
         Err(Unfit::Undescribed) => return,
         Err(unfit) => return hub.leave_out(unfit),
     };
-    hub.offer(topic, &channel);
+    hub.offer(Some(topic), &channel);
     let News::Sample(sample) = news else {
         return;
     };

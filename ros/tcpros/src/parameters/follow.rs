@@ -308,14 +308,14 @@ async fn perform(node: &Inner, work: &Work) -> Result<(), MasterError> {
             )?;
             // An empty map is an empty namespace, or a parameter that is not set.
             let value = if value.as_map().is_some_and(BTreeMap::is_empty) {
-                read(node, name).await?
+                read(&node.master, name).await?
             } else {
                 Some(value)
             };
             heard(node, name, value);
         }
         Work::Read(name) => {
-            let value = read(node, name).await?;
+            let value = read(&node.master, name).await?;
             heard(node, name, value);
         }
         Work::Unsubscribe(name) => {

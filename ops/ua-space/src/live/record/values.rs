@@ -18,6 +18,7 @@ use crate::live::announcements::Announcements;
 use crate::live::book::Sample;
 use crate::live::channels::{Channel, Channels, DESCRIBED_WITHIN, Unfit};
 use crate::live::described::Described;
+use crate::live::robot::Model;
 use crate::report::warn;
 
 /// A recording of the values by topic.
@@ -72,6 +73,23 @@ impl Values {
             left_out: BTreeMap::new(),
             scratch: Vec::new(),
         }
+    }
+
+    /// Adds the model of a robot as the only message of its channel.
+    pub(super) fn add_model(&mut self, model: &Model, time: i128) {
+        let channel = match self.channels.of_model(model) {
+            Ok(channel) => channel,
+            Err(unfit) => return self.leave_out(unfit),
+        };
+        let time = u64::try_from(time).unwrap_or_default();
+        self.writer.channel(&channel, None);
+        self.writer.message(&Message {
+            channel: channel.id,
+            sequence: 0,
+            logged: time,
+            published: time,
+            data: &model.data,
+        });
     }
 
     /// Adds a value that arrived at `now`; `time` is the same time since 1970. Returns false if the

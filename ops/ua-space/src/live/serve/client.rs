@@ -18,6 +18,7 @@ use tokio_tungstenite::tungstenite::http::{StatusCode, Uri};
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::{WebSocketStream, accept_hdr_async_with_config};
 
+use super::assets::AssetRequest;
 use super::hub::{Client, Hub, Next};
 use crate::live::text::harmless;
 use crate::report::warn;
@@ -61,7 +62,7 @@ async fn exchange(stream: WebSocketStream<TcpStream>, hub: &Hub, client: &Client
         loop {
             let message = match client.next() {
                 Next::Text(text) => Message::text(text),
-                Next::Value(value) => Message::binary(value),
+                Next::Binary(value) => Message::binary(value),
                 Next::Nothing => {
                     client.wake.notified().await;
                     continue;
@@ -80,7 +81,11 @@ async fn exchange(stream: WebSocketStream<TcpStream>, hub: &Hub, client: &Client
     let receiving = async {
         while let Some(Ok(message)) = messages.next().await {
             match message {
-                Message::Text(text) => hub.handle(client, &text),
+                Message::Text(text) => {
+                    if let Some(request) = hub.handle(client, &text) {
+                        fetch(hub, client, request).await;
+                    }
+                }
                 Message::Close(_) => break,
                 Message::Binary(_) | Message::Ping(_) | Message::Pong(_) | Message::Frame(_) => {}
             }
@@ -91,6 +96,17 @@ async fn exchange(stream: WebSocketStream<TcpStream>, hub: &Hub, client: &Client
         () = receiving => {}
         // The sender may wait for the viewer, so it cannot end the connection.
         () = client.given_up.notified() => {}
+    }
+}
+
+/// Sends the file of a request. The next request waits until the file is sent, so that a viewer
+/// holds the memory of one file only.
+async fn fetch(hub: &Hub, client: &Client, request: AssetRequest) {
+    let assets = hub.assets.clone();
+    let reading = tokio::task::spawn_blocking(move || assets.response(&request));
+    if let Ok(message) = reading.await {
+        client.push_asset(message);
+        client.asset_sent.notified().await;
     }
 }
 

@@ -7,6 +7,7 @@ use mappings::TopicId;
 use serde_json::{Value, json};
 use tokio::sync::Notify;
 
+use super::assets::{AssetRequest, Assets};
 use crate::live::channels::{Channel, Unfit};
 use crate::report::warn;
 
@@ -15,13 +16,17 @@ use crate::report::warn;
 pub(super) struct Hub {
     /// The name of the server for users.
     name: String,
+    pub(super) assets: Assets,
     state: Mutex<State>,
 }
 
 #[derive(Debug, Default)]
 struct State {
     /// The channels of each topic, as they are advertised: one for each description of the topic.
-    offered: BTreeMap<TopicId, Vec<Offered>>,
+    /// The models of robots have no topic.
+    offered: BTreeMap<Option<TopicId>, Vec<Offered>>,
+    /// The values that each new subscriber gets, by channel.
+    kept: BTreeMap<u16, Kept>,
     clients: BTreeMap<u64, Arc<Client>>,
     last_client: u64,
     /// The reasons that were reported.
@@ -33,6 +38,13 @@ struct State {
 struct Offered {
     channel: u16,
     shown: Value,
+}
+
+/// A value for new subscribers.
+#[derive(Debug)]
+struct Kept {
+    time: u64,
+    data: Vec<u8>,
 }
 
 /// A value in its channel.
@@ -52,6 +64,8 @@ pub(super) struct Client {
     pub(super) wake: Notify,
     /// Ends the connection of a viewer that does not read.
     pub(super) given_up: Notify,
+    /// Announces that the file that the viewer asked for is sent.
+    pub(super) asset_sent: Notify,
 }
 
 /// The messages that wait for a viewer.
@@ -61,6 +75,8 @@ struct Queue {
     control: VecDeque<String>,
     /// The size of all messages of the protocol.
     control_weight: usize,
+    /// The file that the viewer asked for.
+    asset: Option<Vec<u8>>,
     /// Values, oldest first.
     values: VecDeque<Vec<u8>>,
     /// The size of all waiting values.
@@ -76,7 +92,8 @@ struct Queue {
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Next {
     Text(String),
-    Value(Vec<u8>),
+    /// A value or a file.
+    Binary(Vec<u8>),
     /// Nothing waits.
     Nothing,
     /// The connection ends.
@@ -85,9 +102,10 @@ pub(super) enum Next {
 
 impl Hub {
     /// Creates the hub of a group.
-    pub(super) fn new(group: &str) -> Self {
+    pub(super) fn new(group: &str, assets: Assets) -> Self {
         Self {
             name: format!("ua-space live of {group}"),
+            assets,
             state: Mutex::default(),
         }
     }
@@ -101,10 +119,14 @@ impl Hub {
         state.last_client += 1;
         let id = state.last_client;
         let client = Arc::new(Client::default());
+        let capabilities: &[&str] = match self.assets.is_empty() {
+            true => &[],
+            false => &["assets"],
+        };
         let info = json!({
             "op": "serverInfo",
             "name": self.name,
-            "capabilities": [],
+            "capabilities": capabilities,
             "supportedEncodings": [],
             "metadata": {},
             "sessionId": format!("{}-{id}", std::process::id()),
@@ -137,10 +159,16 @@ impl Hub {
         self.state().clients.is_empty()
     }
 
-    /// Offers a channel of a topic. Its other channels stay, because writers with different
-    /// descriptions may alternate. [`Channels`](crate::live::channels::Channels) limits their
-    /// number.
-    pub(super) fn offer(&self, topic: TopicId, channel: &Channel) {
+    /// Offers a channel with one value, which each subscriber gets once.
+    pub(super) fn keep(&self, channel: &Channel, (time, data): (u64, Vec<u8>)) {
+        self.state().kept.insert(channel.id, Kept { time, data });
+        self.offer(None, channel);
+    }
+
+    /// Offers a channel of a topic, or of none. Its other channels stay, because writers with
+    /// different descriptions may alternate. [`Channels`](crate::live::channels::Channels) limits
+    /// their number.
+    pub(super) fn offer(&self, topic: Option<TopicId>, channel: &Channel) {
         let mut state = self.state();
         let others = state.offered.entry(topic).or_default();
         if others.iter().any(|one| one.channel == channel.id) {
@@ -195,10 +223,11 @@ impl Hub {
         }
     }
 
-    /// Handles a message of a viewer.
-    pub(super) fn handle(&self, client: &Client, text: &str) {
+    /// Handles a message of a viewer. Returns the request for a file.
+    pub(super) fn handle(&self, client: &Client, text: &str) -> Option<AssetRequest> {
         let Ok(message) = serde_json::from_str::<Value>(text) else {
-            return client.refuse("this is no JSON object");
+            client.refuse("this is no JSON object");
+            return None;
         };
         let numbers = |list: &str, key: Option<&str>| -> Vec<Value> {
             let all = message.get(list).and_then(Value::as_array);
@@ -226,8 +255,19 @@ impl Hub {
                     }
                 }
             }
+            Some("fetchAsset") if !self.assets.is_empty() => {
+                let id = message.get("requestId").and_then(Value::as_u64);
+                let id = id.and_then(|id| u32::try_from(id).ok());
+                let uri = message.get("uri").and_then(Value::as_str);
+                if let (Some(id), Some(uri)) = (id, uri) {
+                    let uri = uri.to_owned();
+                    return Some(AssetRequest { id, uri });
+                }
+                client.refuse("a request for a file has a number as requestId, and a uri");
+            }
             Some(_) | None => client.refuse("this server is read-only: subscribe or unsubscribe"),
         }
+        None
     }
 
     fn subscribe(&self, client: &Client, id: &Value, channel: &Value) {
@@ -236,16 +276,20 @@ impl Hub {
         let (Some(id), Some(channel)) = (id, channel) else {
             return client.refuse("a subscription has a number as id and as channelId");
         };
-        let is_offered = {
-            let state = self.state();
-            let mut offered = state.offered.values().flatten();
-            offered.any(|one| one.channel == channel)
-        };
-        if !is_offered {
+        let state = self.state();
+        let mut offered = state.offered.values().flatten();
+        if !offered.any(|one| one.channel == channel) {
             return client.refuse(&format!("channel {channel} is not offered"));
         }
         if let Err(why) = client.subscribe(id, channel) {
-            client.refuse(&why);
+            return client.refuse(&why);
+        }
+        if let Some(Kept { time, data }) = state.kept.get(&channel) {
+            client.push(&Publication {
+                channel,
+                time: *time,
+                data,
+            });
         }
     }
 
@@ -275,6 +319,10 @@ impl Client {
             queue.control_weight -= text.len();
             return Next::Text(text);
         }
+        if let Some(asset) = queue.asset.take() {
+            self.asset_sent.notify_one();
+            return Next::Binary(asset);
+        }
         if queue.dropped > 0 {
             let dropped = std::mem::take(&mut queue.dropped);
             let message = format!("{dropped} values dropped: this viewer reads too slowly");
@@ -283,7 +331,7 @@ impl Client {
         match queue.values.pop_front() {
             Some(value) => {
                 queue.weight -= value.len();
-                Next::Value(value)
+                Next::Binary(value)
             }
             None => Next::Nothing,
         }
@@ -328,6 +376,12 @@ impl Client {
             queue.weight -= oldest.len();
             queue.dropped += 1;
         }
+        self.wake.notify_one();
+    }
+
+    /// Queues a file that the viewer asked for. At most one waits.
+    pub(super) fn push_asset(&self, message: Vec<u8>) {
+        self.queue().asset = Some(message);
         self.wake.notify_one();
     }
 

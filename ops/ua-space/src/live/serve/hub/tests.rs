@@ -1,8 +1,11 @@
 use std::time::Duration;
 
+use bridge_node::Environment;
+
 use super::*;
 use crate::live::channels::Channels;
 use crate::live::described::{Described, What};
+use crate::live::robot::Model;
 
 fn published(hub: &Hub, byte: u8, size: usize) {
     hub.publish(&Publication {
@@ -14,13 +17,13 @@ fn published(hub: &Hub, byte: u8, size: usize) {
 
 /// Returns a hub that offers channel 7.
 fn hub() -> Hub {
-    let hub = Hub::new("239.192.0.40:4840");
+    let hub = Hub::new("239.192.0.40:4840", Assets::default());
     let topic = "ua_1_2_10".parse().unwrap();
     let offered = Offered {
         channel: 7,
         shown: json!({"id": 7}),
     };
-    hub.state().offered.insert(topic, vec![offered]);
+    hub.state().offered.insert(Some(topic), vec![offered]);
     hub
 }
 
@@ -44,7 +47,7 @@ fn a_viewer_gets_the_values_of_its_subscriptions() {
     assert!(hub.is_wanted(7) && !hub.is_wanted(8));
     published(&hub, 2, 3);
     let wanted = [&[1, 5, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0][..], &[2; 3]].concat();
-    assert_eq!(client.next(), Next::Value(wanted));
+    assert_eq!(client.next(), Next::Binary(wanted));
     hub.handle(&client, r#"{"op":"unsubscribe","subscriptionIds":[5]}"#);
     assert!(!hub.is_wanted(7));
 }
@@ -60,12 +63,12 @@ fn a_viewer_that_does_not_read_loses_its_oldest_values() {
     }
     assert!(client.queue().weight <= MOST_WEIGHT);
     while text(&client)["op"] != "status" {}
-    let Next::Value(oldest) = client.next() else {
+    let Next::Binary(oldest) = client.next() else {
         panic!("no value");
     };
     assert!(oldest.last() > Some(&90), "the newest values are kept");
     let mut last = oldest;
-    while let Next::Value(value) = client.next() {
+    while let Next::Binary(value) = client.next() {
         last = value;
     }
     assert_eq!(last.last(), Some(&99));
@@ -82,7 +85,7 @@ fn a_viewer_subscribes_to_a_channel_once() {
     let [.., refused] = [text(&client), text(&client), text(&client)];
     assert_eq!(refused["message"], "channel 7 is subscribed already");
     published(&hub, 1, 3);
-    assert!(matches!(client.next(), Next::Value(_)));
+    assert!(matches!(client.next(), Next::Binary(_)));
     assert_eq!(client.next(), Next::Nothing);
     hub.handle(&client, r#"{"op":"unsubscribe","subscriptionIds":[5]}"#);
     hub.handle(&client, subscribe);
@@ -91,7 +94,7 @@ fn a_viewer_subscribes_to_a_channel_once() {
 
 #[test]
 fn writers_whose_descriptions_alternate_leave_all_subscriptions_in_place() {
-    let hub = Hub::new("239.192.0.40:4840");
+    let hub = Hub::new("239.192.0.40:4840", Assets::default());
     let topic: TopicId = "ua_1_2_10".parse().unwrap();
     let (_, client) = hub.connect().unwrap();
     text(&client);
@@ -109,7 +112,7 @@ fn writers_whose_descriptions_alternate_leave_all_subscriptions_in_place() {
     };
     let both = ["; first", "; second"].map(&mut made);
     for channel in &both {
-        hub.offer(topic, channel);
+        hub.offer(Some(topic), channel);
         let advertised = text(&client);
         assert_eq!(advertised["op"], "advertise");
         assert_eq!(advertised["channels"][0]["id"], channel.id);
@@ -120,14 +123,14 @@ fn writers_whose_descriptions_alternate_leave_all_subscriptions_in_place() {
     }
     for _ in 0..3 {
         for channel in &both {
-            hub.offer(topic, channel);
+            hub.offer(Some(topic), channel);
             assert!(hub.is_wanted(channel.id));
             hub.publish(&Publication {
                 channel: channel.id,
                 time: 0,
                 data: &[],
             });
-            let Next::Value(value) = client.next() else {
+            let Next::Binary(value) = client.next() else {
                 panic!("a value and nothing else");
             };
             assert_eq!(value[1..5], (u32::from(channel.id) + 40).to_le_bytes());
@@ -186,4 +189,58 @@ fn a_viewer_cannot_publish_and_the_number_of_viewers_is_limited() {
     assert!(hub.connect().is_none());
     hub.disconnect(id);
     assert!(hub.connect().is_some());
+}
+
+#[test]
+fn each_subscriber_gets_the_model_of_a_robot_once() {
+    let hub = Hub::new("239.192.0.40:4840", Assets::default());
+    let model = Model {
+        topic: "/robot_description".to_owned(),
+        data: vec![1, 2, 3],
+    };
+    let channel = Channels::new().of_model(&model).unwrap();
+    hub.keep(&channel, (9, model.data));
+    let subscribe = json!({
+        "op": "subscribe",
+        "subscriptions": [{"id": 5, "channelId": channel.id}],
+    });
+    for _ in 0..2 {
+        let (_, client) = hub.connect().unwrap();
+        text(&client);
+        let advertised = &text(&client)["channels"][0];
+        assert_eq!(advertised["topic"], "/robot_description");
+        assert_eq!(advertised["schemaName"], "std_msgs/msg/String");
+        assert_eq!(client.next(), Next::Nothing, "not subscribed");
+        hub.handle(&client, &subscribe.to_string());
+        let value = [1, 5, 0, 0, 0, 9, 0, 0, 0, 0, 0, 0, 0, 1, 2, 3].to_vec();
+        assert_eq!(client.next(), Next::Binary(value));
+        assert_eq!(client.next(), Next::Nothing);
+    }
+}
+
+#[test]
+fn files_are_requested_only_from_a_server_that_has_packages() {
+    let fetch = r#"{"op":"fetchAsset","uri":"package://arm/a.stl","requestId":7}"#;
+    let without = hub();
+    let (_, client) = without.connect().unwrap();
+    assert_eq!(text(&client)["capabilities"], json!([]));
+    text(&client);
+    assert_eq!(without.handle(&client, fetch), None);
+    assert_eq!(text(&client)["op"], "status");
+
+    let packages = Environment {
+        ros1: vec!["/opt/ros/noetic/share".into()],
+        ros2: Vec::new(),
+    };
+    let with = Hub::new("239.192.0.40:4840", Assets::new(packages));
+    let (_, client) = with.connect().unwrap();
+    assert_eq!(text(&client)["capabilities"], json!(["assets"]));
+    let uri = "package://arm/a.stl".to_owned();
+    let request = with.handle(&client, fetch);
+    assert_eq!(request, Some(AssetRequest { id: 7, uri }));
+    assert_eq!(with.handle(&client, r#"{"op":"fetchAsset"}"#), None);
+    assert_eq!(text(&client)["op"], "status");
+    client.push_asset(vec![4]);
+    assert_eq!(client.next(), Next::Binary(vec![4]));
+    assert_eq!(client.next(), Next::Nothing);
 }
