@@ -69,6 +69,7 @@ mod shipped_mappings;
 mod skills;
 mod space_verbs;
 mod space_write;
+mod telemetry;
 mod turtlebot3;
 mod uadp_differential;
 mod withdrawn_goals;
