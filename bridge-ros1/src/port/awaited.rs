@@ -75,7 +75,12 @@ impl Ros1Port {
         missing.add(format!("topic {topic}"), || {
             let typed = source.expected.as_ref().filter(|_| source.has_strangers());
             match typed {
-                Some(expected) => format!("{publisher} does not publish it as {expected}"),
+                Some(expected) => match self.graph.types.get(topic) {
+                    Some(of) if *of != expected.to_string() => format!(
+                        "{publisher} publishes it as {of}, but the mapping has the type {expected}"
+                    ),
+                    Some(_) | None => format!("{publisher} does not publish it as {expected}"),
+                },
                 None => format!(
                     "its publisher {publisher} is not connected: the node is unreachable, or it has died \
                      (remove it with `rosnode cleanup`)"

@@ -33,5 +33,6 @@ pub use operations::{
     ConditionAction, ConditionChange, ConditionState, MOST_CONDITIONS, OperationFault, Operations,
 };
 pub use page::{Page, Recorded};
+pub use program::is_intended_drop;
 pub use proxy::{ProxyUrl, ProxyUrlError};
 pub use tls::Pair;

@@ -47,7 +47,7 @@ impl Program {
         let number = |key: &str| counts.get(key).and_then(Value::as_u64).unwrap_or_default();
         let dropped = counts.get("dropped").and_then(Value::as_object);
         let dropped = dropped.into_iter().flatten();
-        let dropped = dropped.filter(|(reason, _)| !INTENDED.contains(&reason.as_str()));
+        let dropped = dropped.filter(|(reason, _)| !is_intended_drop(reason));
         Some(TopicCounts {
             sent: number("sent"),
             delivered: number("delivered"),
@@ -189,7 +189,13 @@ fn help(reason: &str) -> String {
     }
 }
 
-/// Drops that lose nothing: repetitions for late joiners, and values that the mapping leaves out.
+/// Returns whether drops for a reason lose nothing: repetitions for late joiners, and values that
+/// the mapping leaves out.
+#[must_use]
+pub fn is_intended_drop(reason: &str) -> bool {
+    INTENDED.contains(&reason)
+}
+
 const INTENDED: [&str; 4] = ["repeat", "unchanged", "outpaced", "not_asked"];
 const MOST_REASONS: usize = 64;
 const LONGEST_REASON: usize = 400;

@@ -53,6 +53,7 @@ mod survey;
 
 use json_values::{self as values, iso_time, node_ids, status};
 use std::ffi::OsString;
+use std::io::{self, IsTerminal as _, Write as _};
 use std::process::ExitCode;
 
 use clap::Parser as _;
@@ -70,7 +71,13 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
         Ok(arguments) => arguments,
         Err(usage) => {
             // A closed stdout or stderr cannot be reported.
-            let _printed = usage.print();
+            let is_help = usage.kind() == ErrorKind::DisplayHelp;
+            let _printed = if is_help && io::stdout().is_terminal() {
+                let text = live::help_within_width(&usage.to_string());
+                io::stdout().write_all(text.as_bytes())
+            } else {
+                usage.print()
+            };
             let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
             return match asked.contains(&usage.kind()) {
                 true => ExitCode::SUCCESS,

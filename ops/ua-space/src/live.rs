@@ -43,7 +43,7 @@ pub(crate) use robot::ModelSource;
 pub(crate) use seen::{Timing, TopicSeen, listened};
 pub(crate) use serve::serve;
 pub(crate) use skills::{HeardNames, heard_names, skills, types};
-pub(crate) use text::{Table, harmless, is_coloured, wrapped};
+pub(crate) use text::{Table, harmless, help_within_width, is_coloured, wrapped};
 pub(crate) use top::{Sort, top};
 pub(crate) use trace::trace;
 pub(crate) use write::write;

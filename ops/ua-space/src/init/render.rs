@@ -25,11 +25,11 @@ pub(super) fn head(sources: &[String]) -> Vec<String> {
     ];
     lines.extend(sources.iter().map(|one| format!("#   {}", comment(one))));
     let rest = [
-        "# Every program of the cell reads this file and takes its part of it. Change what you like: `ua-space init --merge`",
-        "# adds what is new and leaves the rest as it is. What is marked as a guess wants to be looked at.",
-        "#   ua-space check FILE                  tells what is wrong with it",
-        "#   ua-space check --environment FILE    tells what is not there",
-        "#   ua-space schema > schema.json        has editors complete its keys",
+        "# All programs of the cell read this file. You may change it: `ua-space init --merge` adds new",
+        "# entries and keeps the others. Check the entries that are marked as a guess.",
+        "#   ua-space check FILE                  prints all findings",
+        "#   ua-space check --environment FILE    compares it with the running robots and servers",
+        "#   ua-space schema > schema.json        is for editors, which then complete its keys",
     ];
     lines.extend(rest.map(str::to_owned));
     lines
@@ -48,7 +48,7 @@ pub(super) fn spaces(plan: &Plan, indent: &str) -> Vec<String> {
 pub(super) fn network(plan: &Plan) -> Vec<String> {
     let mut lines = [
         "",
-        "# How values travel between the programs. For several machines name the network card that joins them.",
+        "# The network of the values. For several hosts name the interface that connects them.",
         "pubsub:",
         "  address: opc.udp://239.192.0.40:4840",
         "  # interface: eth0",

@@ -165,6 +165,26 @@ fn wrapped_within(limit: usize, head: &str, text: &str) -> String {
     lines
 }
 
+/// Returns the help of a command within the width of the terminal, which would break it within
+/// words. The further lines of a text are indented like its first.
+pub(crate) fn help_within_width(help: &str) -> String {
+    help_within(width(), help)
+}
+
+fn help_within(limit: usize, help: &str) -> String {
+    let lines = help.lines().map(|line| {
+        let indent = line.len() - line.trim_start().len();
+        let (blank, rest) = line.split_at(indent);
+        // In a list the text follows the name and at least two spaces.
+        let gap = rest.find("  ").unwrap_or_default();
+        let (name, rest) = rest.split_at(gap);
+        let text = rest.trim_start();
+        let (spaces, _) = rest.split_at(rest.len() - text.len());
+        wrapped_within(limit, &format!("{blank}{name}{spaces}"), text)
+    });
+    lines.collect()
+}
+
 /// Returns the width for output: of `COLUMNS`, of the terminal, or 80 columns.
 pub(crate) fn width() -> usize {
     let set = std::env::var("COLUMNS").ok();
@@ -225,6 +245,13 @@ pub(crate) fn micros(us: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_help_is_wrapped_between_words_and_keeps_its_columns() {
+        let help = "Show the values of a topic\n\nCommands:\n  hz    Measure the rate of it\n\n      --json\n          Print a JSON object per value\n";
+        let wanted = "Show the values of\na topic\n\nCommands:\n  hz    Measure\n        the rate of\n        it\n\n      --json\n          Print a\n          JSON\n          object per\n          value\n";
+        assert_eq!(help_within(20, help), wanted);
+    }
 
     #[test]
     fn columns_line_up_and_nothing_of_a_stranger_reaches_the_terminal() {

@@ -74,11 +74,15 @@ fn add_spaces(
         let reason = || match *space == SpaceId::UA {
             true => {
                 format!(
-                    "{reason}: check that ua-server or the component runs and uses this network"
+                    "{reason}: check that ua-server or the component runs and uses this network and \
+                     group"
                 )
             }
             false => {
-                format!("{reason}: check that the bridge of the space runs and uses this network")
+                format!(
+                    "{reason}: check that the bridge of the space runs and uses this network and \
+                     group"
+                )
             }
         };
         missing.add(format!("space {space}"), reason);

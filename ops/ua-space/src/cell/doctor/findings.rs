@@ -5,10 +5,12 @@ use std::net::IpAddr;
 
 use Severity::{Error, Note, Warning};
 use serde::Serialize;
+use supervisor::is_intended_drop;
 
 use super::super::processes::UdpSocket;
 use super::facts::Facts;
 use super::host::{HALT_POLL, IPFRAG_HIGH, RMEM_MAX};
+use crate::cell::Page;
 
 /// A fault, or a setting that may cause a fault.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -522,7 +524,7 @@ fn different_mappings(facts: &Facts) -> Vec<Finding> {
     for page in facts
         .pages
         .iter()
-        .filter(|page| !page.mapping.hash.is_empty())
+        .filter(|page| !page.mapping.hash.is_empty() && !has_own_file(page))
     {
         let hash = page.mapping.hash.as_str();
         by_hash.entry(hash).or_default().push(page.label());
@@ -541,6 +543,11 @@ fn different_mappings(facts: &Facts) -> Vec<Finding> {
         "a value that one program maps may be unknown to the others, or have another type",
         "copy one file to all hosts; SIGHUP or saving the file reloads it",
     )]
+}
+
+/// Returns whether the file of a program is not the mapping of the cell.
+fn has_own_file(page: &Page) -> bool {
+    ["ua-component", "ua-mes", "ua-station"].contains(&page.program.as_str())
 }
 
 fn type_conflicts(facts: &Facts) -> Vec<Finding> {
@@ -572,7 +579,7 @@ fn dropped_samples(facts: &Facts) -> Vec<Finding> {
         for (reason, count) in &page.others.dropped {
             drops.push((*count, "others", reason));
         }
-        drops.retain(|(count, ..)| *count > 0);
+        drops.retain(|(count, _, reason)| *count > 0 && !is_intended_drop(reason));
         drops.sort_by(|a, b| b.cmp(a));
         let total: u64 = drops.iter().map(|(count, ..)| count).sum();
         let most = drops.iter().take(3).map(|(count, topic, reason)| {
@@ -617,7 +624,7 @@ fn not_ready(facts: &Facts) -> Vec<Finding> {
                 ),
                 Warning | Note => (
                     format!("{} {how} {why}", page.label()),
-                    "start this peer, or remove it from the mapping",
+                    "start or correct this peer, or change its entry in the mapping",
                 ),
             };
             finding(

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use clap::ValueEnum;
 use mappings::TopicId;
+use supervisor::is_intended_drop;
 use uadp::MessageKind;
 
 use super::super::book::News;
@@ -220,7 +221,8 @@ impl View {
         let mut drops: BTreeMap<&str, BTreeMap<String, u64>> = BTreeMap::new();
         for (topic, of) in pages.iter().flat_map(|page| &page.topics) {
             let all = drops.entry(topic).or_default();
-            for (reason, count) in of.dropped.iter().filter(|(_, count)| **count > 0) {
+            let lost = |(reason, count): &(&String, &u64)| **count > 0 && !is_intended_drop(reason);
+            for (reason, count) in of.dropped.iter().filter(lost) {
                 *all.entry(reason.clone()).or_default() += count;
             }
         }

@@ -197,6 +197,15 @@ fn programs_that_disagree_are_found() {
         facts.pages.push(other);
     });
     assert_eq!(mapping, ["D032"]);
+    let component = after(|facts| {
+        let mut other = page("ua-component", 0);
+        other.mapping.hash = "f".to_owned();
+        facts.pages.push(other);
+    });
+    assert!(
+        component.is_empty(),
+        "its file is no mapping: {component:?}"
+    );
     let types = after(|facts| facts.group.topics[0].types.push("std_msgs/Bool".to_owned()));
     assert_eq!(types, ["D033"]);
     let version = after(|facts| {
@@ -220,14 +229,18 @@ fn programs_that_disagree_are_found() {
 fn what_programs_report_is_found() {
     let mut facts = healthy();
     let topic = TopicPage {
-        dropped: BTreeMap::from([("too_big".to_owned(), 4)]),
+        dropped: [("too_big", 4), ("repeat", 9)]
+            .map(|(reason, count)| (reason.to_owned(), count))
+            .into(),
         ..TopicPage::default()
     };
     facts.pages[0].topics.insert("ua_1_2_10".to_owned(), topic);
     let found = of(&facts);
     assert_eq!(found[0].code, "D034");
     assert!(
-        found[0].what.contains("4 of Speed (ua_1_2_10) (too_big)"),
+        found[0]
+            .what
+            .ends_with("dropped 4 samples: 4 of Speed (ua_1_2_10) (too_big)"),
         "{found:?}"
     );
     let ready = after(|facts| facts.pages[0].not_ready.push("no keys".to_owned()));
