@@ -86,6 +86,17 @@ pub(crate) async fn execute(
     number: u64,
     teller: &dyn Teller,
 ) -> Run {
+    let (_going, paused) = watch::channel(false);
+    execute_pausable(plant, process, number, (teller, paused)).await
+}
+
+/// Runs a process to its end. No step of a sequence begins while `paused` is true.
+pub(crate) async fn execute_pausable(
+    plant: &Arc<dyn Plant>,
+    process: &Process,
+    number: u64,
+    (teller, paused): (&dyn Teller, watch::Receiver<bool>),
+) -> Run {
     let run = Run::begins(process, plant.now(), number);
     plant.keep(&run);
     info!(process = process.iri, run = run.run, "a process begins");
@@ -103,6 +114,7 @@ pub(crate) async fn execute(
         process,
         log: &log,
         teller,
+        paused,
     }
     .run()
     .await;
@@ -217,6 +229,8 @@ struct Execution<'a> {
     process: &'a Process,
     log: &'a Arc<Log>,
     teller: &'a dyn Teller,
+    /// Whether no step may begin.
+    paused: watch::Receiver<bool>,
 }
 
 /// The result of a plan.

@@ -47,11 +47,11 @@ struct Shown {
 }
 
 impl JobControl {
-    /// Creates the objects for the jobs of the MES.
-    pub(crate) fn new(jobs: Arc<Jobs>, runtime: Handle) -> Self {
+    /// Creates the objects for the jobs and the job orders of the MES.
+    pub(crate) fn new(jobs: Arc<Jobs>, orders: Orders, runtime: Handle) -> Self {
         Self(Arc::new(Inner {
             jobs,
-            orders: Mutex::default(),
+            orders: Mutex::new(orders),
             runtime,
         }))
     }

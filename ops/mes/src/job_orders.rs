@@ -2,18 +2,24 @@
 //! process; its run is a job of the MES.
 
 use plant_opcua::job_control::JobOrder;
+use serde::{Deserialize, Serialize};
 use serde_json::Value as Json;
+use tracing::error;
 
-/// The states of a job order, with their numbers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+use crate::order_file::OrderFile;
+
+/// The states of a job order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum OrderState {
-    NotAllowedToStart = 1,
-    AllowedToStart = 2,
-    Running = 3,
+    NotAllowedToStart,
+    AllowedToStart,
+    Running,
+    /// The run is paused: no skill runs, and no further step begins. Clients see Interrupted.
+    Paused,
     /// The outcome of the run is unknown: its machines may move.
-    Interrupted = 4,
-    Ended = 5,
-    Aborted = 6,
+    Interrupted,
+    Ended,
+    Aborted,
 }
 
 impl OrderState {
@@ -22,14 +28,21 @@ impl OrderState {
             Self::NotAllowedToStart => "NotAllowedToStart",
             Self::AllowedToStart => "AllowedToStart",
             Self::Running => "Running",
-            Self::Interrupted => "Interrupted",
+            Self::Paused | Self::Interrupted => "Interrupted",
             Self::Ended => "Ended",
             Self::Aborted => "Aborted",
         }
     }
 
     pub(crate) const fn number(self) -> u32 {
-        self as u32
+        match self {
+            Self::NotAllowedToStart => 1,
+            Self::AllowedToStart => 2,
+            Self::Running => 3,
+            Self::Paused | Self::Interrupted => 4,
+            Self::Ended => 5,
+            Self::Aborted => 6,
+        }
     }
 }
 
@@ -72,13 +85,18 @@ pub(crate) trait JobRuns: Send + Sync {
     /// Stops a job, or gives back the components of a job with an unknown outcome.
     fn stop(&self, job: u64);
 
+    /// Pauses or resumes a job between its steps. Returns whether that is possible.
+    fn pause(&self, job: u64, is_paused: bool) -> bool;
+
     /// Returns the progress of a job.
     fn progress(&self, job: u64) -> Option<JobProgress>;
 }
 
 /// The progress of a job. Times are in ms since 1970.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct JobProgress {
+    /// Whether the job is paused, and no skill runs.
+    pub(crate) is_paused: bool,
     pub(crate) outcome: JobOutcome,
     pub(crate) reason: Option<String>,
     pub(crate) started_ms: u64,
@@ -88,7 +106,7 @@ pub(crate) struct JobProgress {
 }
 
 /// The outcome of a job.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum JobOutcome {
     Running,
     Done,
@@ -105,7 +123,7 @@ pub(crate) struct Order {
     pub(crate) progress: Option<JobProgress>,
     /// The reason of the last change of the state, if there is one.
     pub(crate) reason: Option<String>,
-    process: String,
+    pub(crate) process: String,
     job: Option<u64>,
     /// The state that a client wants the run to end in.
     wanted: Option<OrderState>,
@@ -117,10 +135,43 @@ impl Order {
     }
 }
 
+impl Order {
+    /// Restores a job order of an earlier run of the program. Nothing is started again: an order
+    /// that was allowed to start may have been started, so its outcome is unknown.
+    pub(crate) fn restored(
+        (order, process): (JobOrder, String),
+        state: OrderState,
+        (progress, reason): (Option<JobProgress>, Option<String>),
+    ) -> Self {
+        let (state, reason) = match state {
+            OrderState::AllowedToStart
+            | OrderState::Running
+            | OrderState::Paused
+            | OrderState::Interrupted => {
+                let why = "the program ended before the end of the job was known";
+                (OrderState::Interrupted, Some(why.to_owned()))
+            }
+            OrderState::NotAllowedToStart | OrderState::Ended | OrderState::Aborted => {
+                (state, reason)
+            }
+        };
+        Self {
+            order,
+            state,
+            progress,
+            reason,
+            process,
+            job: None,
+            wanted: None,
+        }
+    }
+}
+
 /// The job orders of the MES.
 #[derive(Debug, Default)]
 pub(crate) struct Orders {
     all: Vec<Order>,
+    file: Option<OrderFile>,
 }
 
 /// A command for a job order.
@@ -137,8 +188,28 @@ pub(crate) enum Command {
 }
 
 impl Orders {
+    /// Creates the job orders of a file, which stores each change.
+    pub(crate) fn of_file((file, all): (OrderFile, Vec<Order>)) -> Self {
+        Self {
+            all,
+            file: Some(file),
+        }
+    }
+
     pub(crate) fn all(&self) -> &[Order] {
         &self.all
+    }
+
+    /// Stores all orders. Returns whether they are stored, or need not be.
+    fn keep(&self) -> bool {
+        let Some(file) = &self.file else { return true };
+        match file.write(&self.all) {
+            Ok(()) => true,
+            Err(error) => {
+                error!(%error, "cannot store the job orders");
+                false
+            }
+        }
     }
 
     /// Returns the job order with an ID.
@@ -164,7 +235,11 @@ impl Orders {
             job: None,
             wanted: None,
         });
-        Status::Good
+        if self.keep() {
+            return Status::Good;
+        }
+        self.all.pop();
+        Status::UnableToAccept
     }
 
     /// Replaces a job order that has not been started.
@@ -178,9 +253,9 @@ impl Orders {
         }
         match process_of(&order, runs) {
             Ok(process) => {
-                known.process = process;
-                known.order = order;
-                Status::Good
+                let before = known.clone();
+                (known.process, known.order) = (process, order);
+                self.kept_or(before)
             }
             Err(status) => status,
         }
@@ -188,20 +263,30 @@ impl Orders {
 
     /// Executes a command.
     pub(crate) fn command(&mut self, id: &str, command: Command, runs: &dyn JobRuns) -> Status {
-        use OrderState::{Aborted, AllowedToStart, Ended, Interrupted, NotAllowedToStart, Running};
+        use OrderState::{
+            Aborted, AllowedToStart, Ended, Interrupted, NotAllowedToStart, Paused, Running,
+        };
         let Some(place) = self.all.iter().position(|order| order.id() == id) else {
             return Status::UnknownOrder;
         };
         let Some(order) = self.all.get_mut(place) else {
             return Status::UnknownOrder;
         };
+        let before = order.clone();
         match (command, order.state) {
-            (Command::Start, NotAllowedToStart) => order.state = AllowedToStart,
+            // It is stored before anything starts: after a restart it may have been started.
+            (Command::Start, NotAllowedToStart) => {
+                order.state = AllowedToStart;
+                let kept = self.kept_or(before);
+                if kept != Status::Good {
+                    return kept;
+                }
+            }
             (Command::RevokeStart, AllowedToStart) => order.state = NotAllowedToStart,
             (Command::Cancel, NotAllowedToStart | AllowedToStart)
             | (Command::Clear, Ended | Aborted) => drop(self.all.remove(place)),
             (Command::Abort, NotAllowedToStart | AllowedToStart) => order.state = Aborted,
-            (Command::Stop | Command::Abort, Running) => {
+            (Command::Stop | Command::Abort, Running | Paused) => {
                 let progress = order.job.and_then(|job| runs.progress(job));
                 let is_running = |of: &JobProgress| of.outcome == JobOutcome::Running;
                 // A stop gives back the components of a run with an unknown outcome, which the
@@ -227,19 +312,45 @@ impl Orders {
                     Aborted
                 };
             }
-            // A run cannot be paused between its steps.
-            (Command::Pause | Command::Resume, Running | Interrupted) => {
-                return Status::UnableToAccept;
+            (Command::Pause, Running) | (Command::Resume, Running | Paused) => {
+                let is_paused = command == Command::Pause;
+                // A composite cannot be paused between its steps.
+                if !order.job.is_some_and(|job| runs.pause(job, is_paused)) {
+                    return Status::UnableToAccept;
+                }
             }
+            (Command::Resume, Interrupted) => return Status::UnableToAccept,
             _ => return Status::InvalidState,
         }
-        self.poll(runs);
+        if !self.poll(runs) {
+            self.keep();
+        }
         Status::Good
     }
 
-    /// Starts the job orders that are allowed to start, and follows the runs. Returns whether an
-    /// order has changed.
+    /// Stores a changed order, or restores it as it was before.
+    fn kept_or(&mut self, before: Order) -> Status {
+        if self.keep() {
+            return Status::Good;
+        }
+        let mut all = self.all.iter_mut();
+        if let Some(known) = all.find(|known| known.order.id == before.order.id) {
+            *known = before;
+        }
+        Status::UnableToAccept
+    }
+
+    /// Starts the job orders that are allowed to start, follows the runs, and stores changes.
+    /// Returns whether an order has changed.
     pub(crate) fn poll(&mut self, runs: &dyn JobRuns) -> bool {
+        let has_changed = self.follow(runs);
+        if has_changed {
+            self.keep();
+        }
+        has_changed
+    }
+
+    fn follow(&mut self, runs: &dyn JobRuns) -> bool {
         let mut has_changed = false;
         for order in &mut self.all {
             if order.state == OrderState::AllowedToStart {
@@ -256,7 +367,8 @@ impl Orders {
                 }
                 has_changed = true;
             }
-            let Some(job) = order.job.filter(|_| order.state == OrderState::Running) else {
+            let follows = matches!(order.state, OrderState::Running | OrderState::Paused);
+            let Some(job) = order.job.filter(|_| follows) else {
                 continue;
             };
             let Some(progress) = runs.progress(job) else {
@@ -268,6 +380,7 @@ impl Orders {
             };
             let wanted = order.wanted.unwrap_or(OrderState::Aborted);
             let state = match progress.outcome {
+                JobOutcome::Running if progress.is_paused => OrderState::Paused,
                 JobOutcome::Running => OrderState::Running,
                 JobOutcome::Done => OrderState::Ended,
                 JobOutcome::Failed => wanted,
@@ -326,6 +439,7 @@ mod tests {
     struct Fakes {
         outcome: Mutex<Option<JobOutcome>>,
         is_busy: Mutex<bool>,
+        is_paused: Mutex<bool>,
         calls: Mutex<Vec<String>>,
     }
 
@@ -347,8 +461,16 @@ mod tests {
             self.calls.lock().unwrap().push(format!("stop {job}"));
         }
 
+        fn pause(&self, job: u64, is_paused: bool) -> bool {
+            let call = if is_paused { "pause" } else { "resume" };
+            self.calls.lock().unwrap().push(format!("{call} {job}"));
+            *self.is_paused.lock().unwrap() = is_paused;
+            true
+        }
+
         fn progress(&self, _job: u64) -> Option<JobProgress> {
             Some(JobProgress {
+                is_paused: *self.is_paused.lock().unwrap(),
                 outcome: (*self.outcome.lock().unwrap())?,
                 reason: None,
                 started_ms: 1,
@@ -408,10 +530,6 @@ mod tests {
         for command in [Command::Start, Command::Cancel, Command::Clear] {
             assert_eq!(orders.command("one", command, &runs), Status::InvalidState);
         }
-        assert_eq!(
-            orders.command("one", Command::Pause, &runs),
-            Status::UnableToAccept
-        );
         *runs.outcome.lock().unwrap() = Some(JobOutcome::Done);
         assert!(orders.poll(&runs));
         assert_eq!(state(&orders), OrderState::Ended);
@@ -422,6 +540,77 @@ mod tests {
             ["start urn:p"],
             "it was started once"
         );
+    }
+
+    #[test]
+    fn a_pause_is_seen_when_no_skill_runs_and_ends_with_resume() {
+        let runs = Fakes::default();
+        let mut orders = Orders::default();
+        orders.store(job_order("one", "urn:p"), &runs);
+        assert_eq!(
+            orders.command("one", Command::Resume, &runs),
+            Status::InvalidState
+        );
+        orders.command("one", Command::Start, &runs);
+        assert_eq!(orders.command("one", Command::Pause, &runs), Status::Good);
+        assert_eq!(state(&orders).number(), 4);
+        assert_eq!(
+            orders.command("one", Command::Pause, &runs),
+            Status::InvalidState
+        );
+        assert_eq!(orders.command("one", Command::Resume, &runs), Status::Good);
+        assert_eq!(state(&orders), OrderState::Running);
+        orders.command("one", Command::Pause, &runs);
+        assert_eq!(orders.command("one", Command::Stop, &runs), Status::Good);
+        *runs.outcome.lock().unwrap() = Some(JobOutcome::Failed);
+        orders.poll(&runs);
+        assert_eq!(state(&orders), OrderState::Ended);
+        let calls = ["start urn:p", "pause 7", "resume 7", "pause 7", "stop 7"];
+        assert_eq!(*runs.calls.lock().unwrap(), calls);
+    }
+
+    #[test]
+    fn after_a_restart_nothing_starts_and_what_may_have_run_is_unknown() {
+        let folder = std::env::temp_dir().join(format!("job-orders-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let open = || Orders::of_file(OrderFile::open(&folder).unwrap());
+        let runs = Fakes::default();
+        let mut orders = open();
+        for id in ["one", "stored", "done", "waits", "gone"] {
+            assert_eq!(orders.store(job_order(id, "urn:p"), &runs), Status::Good);
+        }
+        orders.command("done", Command::Start, &runs);
+        *runs.outcome.lock().unwrap() = Some(JobOutcome::Done);
+        orders.poll(&runs);
+        orders.command("one", Command::Start, &runs);
+        *runs.is_busy.lock().unwrap() = true;
+        orders.command("waits", Command::Start, &runs);
+        orders.command("gone", Command::Cancel, &runs);
+        drop(orders);
+        *runs.is_busy.lock().unwrap() = false;
+        runs.calls.lock().unwrap().clear();
+        let mut orders = open();
+        assert!(!orders.poll(&runs));
+        let states = orders.all().iter().map(|order| (order.id(), order.state));
+        let states: Vec<_> = states.collect();
+        let expected = [
+            ("one", OrderState::Interrupted),
+            ("stored", OrderState::NotAllowedToStart),
+            ("done", OrderState::Ended),
+            ("waits", OrderState::Interrupted),
+        ];
+        assert_eq!(states, expected);
+        let done = orders.order("done").unwrap();
+        assert!(done.progress.is_some() && done.order == job_order("done", "urn:p"));
+        assert_eq!(
+            orders.command("one", Command::Resume, &runs),
+            Status::UnableToAccept
+        );
+        assert_eq!(orders.command("one", Command::Abort, &runs), Status::Good);
+        assert!(runs.calls.lock().unwrap().is_empty(), "nothing was started");
+        drop(orders);
+        assert_eq!(open().order("one").unwrap().state, OrderState::Aborted);
+        std::fs::remove_dir_all(&folder).unwrap();
     }
 
     #[test]

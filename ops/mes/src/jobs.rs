@@ -10,8 +10,9 @@ use tokio::runtime::Handle;
 use tokio::sync::watch;
 
 use crate::cell::{Cell, now};
-use crate::execute::{Plant, execute};
+use crate::execute::{Plant, execute_pausable};
 use crate::job_orders::{JobOutcome, JobProgress, JobRuns};
+use crate::process::Job as Work;
 use crate::record::{How, Run};
 
 /// The jobs.
@@ -38,8 +39,14 @@ struct Job {
     ended_ms: Option<u64>,
     /// Components that no other run may use, because the outcome is unknown.
     holds: Vec<String>,
+    /// Whether no further step begins.
+    paused: bool,
+    #[serde(skip)]
+    can_pause: bool,
     #[serde(skip)]
     stop: watch::Sender<bool>,
+    #[serde(skip)]
+    pause: watch::Sender<bool>,
 }
 
 impl Jobs {
@@ -58,6 +65,7 @@ impl knowledge::Jobs for Jobs {
         let process = self.cell.process(process)?;
         let number = self.cell.next_run();
         let (stop, stopped) = watch::channel(false);
+        let (pause, paused) = watch::channel(false);
         {
             let mut all = locked(&self.all);
             let running = all.values().filter(|job| job.outcome == How::Running);
@@ -75,7 +83,10 @@ impl knowledge::Jobs for Jobs {
                 started_ms: now(),
                 ended_ms: None,
                 holds: Vec::new(),
+                paused: false,
+                can_pause: matches!(process.work, Work::Sequence),
                 stop,
+                pause,
             };
             all.insert(number, job);
             while all.len() > MOST_JOBS {
@@ -94,7 +105,7 @@ impl knowledge::Jobs for Jobs {
                 stopped,
             };
             let plant: Arc<dyn Plant> = Arc::clone(&cell) as Arc<dyn Plant>;
-            let run = execute(&plant, &process, number, &telling).await;
+            let run = execute_pausable(&plant, &process, number, (&telling, paused)).await;
             let holds = cell.used_by(&run.run);
             ended(&all, number, run, holds);
         }));
@@ -144,6 +155,17 @@ impl JobRuns for Jobs {
         knowledge::Jobs::stop(self, job);
     }
 
+    fn pause(&self, job: u64, is_paused: bool) -> bool {
+        let mut all = locked(&self.all);
+        let job = all.get_mut(&job);
+        let Some(job) = job.filter(|job| job.outcome == How::Running && job.can_pause) else {
+            return false;
+        };
+        job.paused = is_paused;
+        job.pause.send_replace(is_paused);
+        true
+    }
+
     fn progress(&self, job: u64) -> Option<JobProgress> {
         let known = locked(&self.all).get(&job).cloned()?;
         let mut runs = self.cell.runs().into_iter();
@@ -152,13 +174,15 @@ impl JobRuns for Jobs {
             .iter()
             .flat_map(|run| &run.plans)
             .flat_map(|plan| &plan.ran);
-        let results = ran.flat_map(|ran| {
+        let results = ran.clone().flat_map(|ran| {
             let one = |(name, value): (&String, &serde_json::Value)| {
                 (format!("{}.{name}", ran.step), value.clone())
             };
             ran.results.iter().map(one)
         });
+        let is_at_rest = ran.clone().all(|ran| ran.outcome != How::Running);
         Some(JobProgress {
+            is_paused: known.paused && is_at_rest,
             outcome: match known.outcome {
                 How::Running => JobOutcome::Running,
                 How::Done => JobOutcome::Done,
@@ -182,6 +206,7 @@ impl Job {
 
 fn ended(all: &Mutex<BTreeMap<u64, Job>>, number: u64, run: Run, holds: Vec<String>) {
     if let Some(job) = locked(all).get_mut(&number) {
+        job.paused = false;
         job.outcome = run.outcome;
         job.reason = run.reason;
         job.run = Some(run.run);

@@ -14,7 +14,7 @@
 //! - `sources`: from files to the graph, while the program runs
 //! - `goal`: the search for a sequence that reaches a goal
 //! - `jobs`: processes that clients start, several at a time
-//! - `job_orders`, `job_control`: jobs for clients of OPC 10031-4
+//! - `job_orders`, `order_file`, `job_control`: jobs for clients of OPC 10031-4
 //! - `execution_skill` and `locate_skill`: the skills of the MES
 
 mod cell;
@@ -27,6 +27,7 @@ mod job_orders;
 mod jobs;
 mod live;
 mod locate_skill;
+mod order_file;
 mod plan;
 mod process;
 mod read_process;
@@ -62,8 +63,10 @@ use ua_component::{ComponentPort, Options, made};
 use crate::cell::Cell;
 use crate::execution_skill::ExecuteProcess;
 use crate::job_control::JobControl;
+use crate::job_orders::Orders;
 use crate::jobs::Jobs;
 use crate::locate_skill::LocateObject;
+use crate::order_file::OrderFile;
 use crate::settings::{Connect, Settings};
 use crate::sources::Sources;
 
@@ -439,7 +442,16 @@ impl Program for UaMes {
         let ready = self.ready()?;
         let jobs = Arc::new(Jobs::new(Arc::clone(&ready.cell), Handle::current()));
         self.serve(ready, Arc::clone(&jobs)).await?;
-        let control = JobControl::new(jobs, Handle::current());
+        let folder = self.store.as_ref().or(ready.settings.store.as_ref());
+        let orders = match folder {
+            Some(folder) => Orders::of_file(OrderFile::open(folder).map_err(|error| {
+                let shown = folder.display();
+                let what = format!("cannot read the job orders in {shown}: {error}");
+                Failure::new(FailureKind::Io, what)
+            })?),
+            None => Orders::default(),
+        };
+        let control = JobControl::new(jobs, orders, Handle::current());
         let gds = self.gds.invitation();
         let gds = gds.map_err(|fault| Failure::new(FailureKind::Usage, fault.to_string()))?;
         let options = Options {

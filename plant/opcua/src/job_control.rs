@@ -6,9 +6,10 @@ use std::sync::LazyLock;
 
 use opcua::types::xml::{XmlEncodable, XmlStreamWriter, XmlType};
 use opcua::types::{
-    BinaryDecodable, BinaryEncodable, Context, DateTime, EUInformation, EncodingResult,
-    ExpandedMessageInfo, ExpandedNodeId, LocalizedText, RelativePath, StaticTypeLoader,
-    TypeLoaderInstance, UAString, UaNullable, Variant, XmlEncodable, XmlType, binary_decode_to_enc,
+    BinaryDecodable, BinaryEncodable, Context, ContextOwned, DateTime, EUInformation,
+    EncodingResult, ExpandedMessageInfo, ExpandedNodeId, LocalizedText, RelativePath,
+    StaticTypeLoader, TypeLoaderInstance, UAString, UaNullable, Variant, XmlEncodable, XmlType,
+    binary_decode_to_enc,
 };
 
 /// The namespace of Job Control, version 2.
@@ -276,6 +277,24 @@ structures! {
         order: JobOrder,
         /// The states, the main state first.
         states: Option<Vec<State>>,
+    }
+}
+
+impl JobOrder {
+    /// Returns the binary encoding, for storage.
+    #[must_use]
+    pub fn to_bytes(&self) -> Vec<u8> {
+        BinaryEncodable::encode_to_vec(self, &ContextOwned::default().context())
+    }
+
+    /// Decodes the binary encoding.
+    ///
+    /// # Errors
+    /// Returns the reason why the bytes are no job order.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
+        let (mut from, context) = (bytes, ContextOwned::default());
+        let decoded = <Self as BinaryDecodable>::decode(&mut from, &context.context());
+        decoded.map_err(|error| error.to_string())
     }
 }
 

@@ -118,7 +118,7 @@ impl Execution<'_> {
         let mut begun: BTreeMap<usize, &str> = BTreeMap::new();
         let mut ended = Ended::Done;
         loop {
-            while matches!(ended, Ended::Done) {
+            while matches!(ended, Ended::Done) && !*self.paused.borrow() {
                 let (number, place) = match self.ready(chosen, &begun, &mut *progress) {
                     Ok(Some(ready)) => ready,
                     Ok(None) => break,
@@ -148,7 +148,23 @@ impl Execution<'_> {
                     }
                 }
             }
-            let Some((number, offer, end)) = running.next().await else {
+            let mut steps = 0..self.process.steps.len();
+            let is_left = steps.any(|number| !progress.is_over(number));
+            let is_paused = *self.paused.borrow() && matches!(ended, Ended::Done) && is_left;
+            let next = match is_paused {
+                false => running.next().await,
+                true => tokio::select! {
+                    biased;
+                    Some(next) = running.next() => Some(next),
+                    () = self.resumed() => continue,
+                    // A running step ends by itself when the run is stopped.
+                    () = self.teller.stopped(), if running.is_empty() => {
+                        ended = Ended::Over("stopped".to_owned());
+                        None
+                    }
+                },
+            };
+            let Some((number, offer, end)) = next else {
                 break;
             };
             begun.remove(&number);
@@ -159,6 +175,15 @@ impl Execution<'_> {
             return Ended::Over("steps of the process wait for each other".to_owned());
         }
         ended
+    }
+
+    /// Completes when steps may begin.
+    async fn resumed(&self) {
+        let mut paused = self.paused.clone();
+        if paused.wait_for(|is_paused| !is_paused).await.is_err() {
+            // Nobody can resume the run any more; it can be stopped.
+            std::future::pending::<()>().await;
+        }
     }
 
     /// Returns a step that can begin. Steps whose conditions do not hold are skipped. A component
