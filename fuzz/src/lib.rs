@@ -16,13 +16,17 @@ mod manifest;
 mod mapping;
 mod mdns;
 mod message;
+mod model;
 mod nodeset;
+mod recipe;
 mod registry;
+mod rml;
 mod secured;
 #[path = "../../ros/messages/tests/support/mod.rs"]
 mod tape;
 
 pub use self::registry::registry;
+pub use self::rml::rml;
 pub use action::action;
 pub use calls::calls;
 pub use chunks::chunks;
@@ -34,7 +38,9 @@ pub use manifest::manifest;
 pub use mapping::mapping;
 pub use mdns::mdns;
 pub use message::message;
+pub use model::model;
 pub use nodeset::nodeset;
+pub use recipe::recipe;
 pub use secured::secured;
 
 /// A function that panics if the tested code violates a guarantee on the input.
@@ -53,7 +59,10 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("mapping", mapping),
     ("mdns", mdns),
     ("message", message),
+    ("model", model),
     ("nodeset", nodeset),
+    ("recipe", recipe),
     ("registry", registry),
+    ("rml", rml),
     ("secured", secured),
 ];

@@ -146,6 +146,24 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     bridge_node::run::<UaMes>(arguments)
 }
 
+/// Reads a recipe of BatchML or BPMN, as `ua-space process import` sends it. Returns the number of its
+/// processes; `None` if the contents are no recipe. For tests with changed files.
+///
+/// # Errors
+/// The lines of the elements that no process can have, from 1; no line if the contents cannot be
+/// decoded.
+#[doc(hidden)]
+pub fn read_recipe(contents: &[u8]) -> Result<Option<usize>, Vec<usize>> {
+    let found = recipe::in_source(contents).map_err(|_| Vec::new())?;
+    let Some((text, names)) = found else {
+        return Ok(None);
+    };
+    match recipe::read(&text, &names) {
+        Ok(recipe) => Ok(Some(recipe.processes.len())),
+        Err(findings) => Err(findings.iter().map(|finding| finding.line).collect()),
+    }
+}
+
 impl UaMes {
     fn ready(&self) -> Result<&Ready, Failure> {
         if let Some(ready) = self.ready.get() {

@@ -62,6 +62,16 @@ use clap::error::ErrorKind;
 use arguments::{Arguments, Verb};
 use exit::Failure;
 
+/// Reads a SysML model: XMI, or the textual notation of SysML v2. Returns the number of its values and
+/// calls. For tests with changed files.
+///
+/// # Errors
+/// The lines of the findings, from 1.
+#[doc(hidden)]
+pub fn read_model(content: &str) -> Result<usize, Vec<usize>> {
+    survey::model::counted(content)
+}
+
 /// Runs `ua-space` from its command line to its end. `arguments` begin with the name of the
 /// program.
 #[must_use]

@@ -194,6 +194,14 @@ fn parse(content: &str) -> Result<Model, Vec<Finding>> {
     }
 }
 
+/// Returns the number of values and calls of a model, or the lines of all its findings.
+pub(crate) fn counted(content: &str) -> Result<usize, Vec<usize>> {
+    match parse(content) {
+        Ok(model) => Ok(model.values.len() + model.calls.len()),
+        Err(findings) => Err(findings.iter().map(|finding| finding.line).collect()),
+    }
+}
+
 /// Shortens text of the file and escapes control characters.
 fn shown(text: &str) -> String {
     let short: String = text.chars().take(64).collect();
