@@ -1,10 +1,12 @@
-//! `ua-space aas`: the asset administration shell (AAS V3, JSON) of a process module, from its
-//! manifest.
+//! `ua-space aas`: the asset administration shell (AAS V3) of a process module, from its manifest, as
+//! JSON or as a package (AASX).
 
 mod elements;
+mod package;
 mod submodels;
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::io::{self, Write as _};
 
 use mtp::{Family, Link, Module};
@@ -12,6 +14,7 @@ use serde_json::{Value, json};
 
 use crate::arguments::AasArguments;
 use crate::exit::Failure;
+use crate::input;
 use crate::live::harmless;
 use crate::mtp_files::read;
 use crate::report::warn;
@@ -21,6 +24,10 @@ use elements::{Names, reference};
 
 /// Runs `ua-space aas`.
 pub(crate) fn aas(arguments: &AasArguments) -> Result<(), Failure> {
+    if arguments.aasx.is_some() && arguments.file == "-" {
+        let why = "--aasx needs the manifest as a file, whose name the package has";
+        return Err(Failure::Usage(why.to_owned()));
+    }
     let module = read(&arguments.file)?;
     let mut facts = of_module(&module);
     for given in &arguments.nameplate {
@@ -52,8 +59,21 @@ pub(crate) fn aas(arguments: &AasArguments) -> Result<(), Failure> {
     }
     let text = serde_json::to_string_pretty(&environment)
         .map_err(|error| Failure::Data(format!("cannot write JSON: {error}")))?;
-    writeln!(io::stdout().lock(), "{text}")?;
-    Ok(())
+    let Some(path) = &arguments.aasx else {
+        writeln!(io::stdout().lock(), "{text}")?;
+        return Ok(());
+    };
+    let manifest = package::Manifest {
+        path: &submodels::package_path(&file),
+        content_type: submodels::content_type(&file),
+        contents: &input::read(&arguments.file)?,
+    };
+    let written = package::package(&text, &manifest).and_then(|bytes| {
+        let mut to = File::create_new(path)?;
+        to.write_all(&bytes)?;
+        to.sync_all()
+    });
+    written.map_err(|error| Failure::Io(format!("cannot write {}: {error}", path.display())))
 }
 
 /// Returns the environment of a module with these facts of its nameplate, and the mandatory fields

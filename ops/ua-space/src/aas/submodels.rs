@@ -319,19 +319,28 @@ fn href(node: &Node) -> String {
     format!("{}/?id={}", node.endpoint, node.id())
 }
 
-/// Returns the manifest itself, by the name of its file.
-pub(super) fn module_type_package(asset: &str, file: &str, module: &Module) -> Value {
+/// Returns the content type of a manifest by the name of its file.
+pub(super) fn content_type(file: &str) -> &'static str {
     let is_container = [".mtp", ".amlx"]
         .iter()
         .any(|ending| file.ends_with(ending));
-    let content_type = match is_container {
+    match is_container {
         true => "application/automationml-amlx+zip",
         false => "application/automationml-aml+xml",
-    };
-    let name: String = file.rsplit('/').next().unwrap_or(file).to_owned();
+    }
+}
+
+/// Returns the path of a manifest in a package.
+pub(super) fn package_path(file: &str) -> String {
+    let name = file.rsplit('/').next().unwrap_or(file);
+    format!("/aasx/files/{}", mtp::escaped(name))
+}
+
+/// Returns the manifest itself, by the name of its file.
+pub(super) fn module_type_package(asset: &str, file: &str, module: &Module) -> Value {
     let mut elements = vec![json!({
-        "modelType": "File", "idShort": "MTPFile", "contentType": content_type,
-        "value": format!("/aasx/files/{}", mtp::escaped(&name)),
+        "modelType": "File", "idShort": "MTPFile", "contentType": content_type(file),
+        "value": package_path(file),
     })];
     if !module.version.is_empty() {
         elements.push(property("Version", "string", &module.version));

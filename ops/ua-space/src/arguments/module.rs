@@ -1,5 +1,7 @@
 //! The command line arguments of the commands for process modules (MTP).
 
+use std::path::PathBuf;
+
 use clap::{Args, Subcommand};
 
 use super::live::seconds;
@@ -106,6 +108,10 @@ pub(crate) struct AasArguments {
     /// repeated. Without all mandatory fields the nameplate is left out
     #[arg(long, value_name = "NAME=VALUE")]
     pub(crate) nameplate: Vec<String>,
+    /// Write a package (AASX) with the shell and the manifest into this file, in place of JSON to
+    /// stdout. A file that is there is not replaced
+    #[arg(long, value_name = "FILE")]
+    pub(crate) aasx: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
