@@ -2,6 +2,7 @@
 
 mod composite;
 mod files;
+mod flow;
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -187,7 +188,11 @@ impl Reading<'_> {
         }
     }
 
-    fn each<T>(&mut self, node: &Node, read: fn(&mut Self, &Node) -> Option<T>) -> Vec<T> {
+    fn each<T>(
+        &mut self,
+        node: &Node,
+        mut read: impl FnMut(&mut Self, &Node) -> Option<T>,
+    ) -> Vec<T> {
         let nodes = self.reader.list(node);
         nodes.iter().filter_map(|node| read(self, node)).collect()
     }
@@ -287,8 +292,17 @@ impl Reading<'_> {
         kind: Result<(), (usize, usize)>,
         earlier: &[Step],
     ) -> Option<Step> {
-        let keys = ["step", "needs", "parameters", "by", "compensation"];
-        let [name, needs, parameters, by, compensation] = self.reader.map(node, keys)?;
+        let keys = [
+            "step",
+            "needs",
+            "parameters",
+            "by",
+            "compensation",
+            "after",
+            "when",
+            "within",
+        ];
+        let [name, needs, parameters, by, compensation, flow @ ..] = self.reader.map(node, keys)?;
         let name = self
             .reader
             .needed(name, "step", node.place)
@@ -328,6 +342,10 @@ impl Reading<'_> {
             by,
             ..Step::default()
         };
+        for key in flow.into_iter().flatten() {
+            self.only_alone(key, kind.is_err(), "does all its steps in one order")?;
+        }
+        self.flow(&mut step, flow, earlier)?;
         if let Some(node) = compensation {
             self.only_alone(node, kind.is_err(), "retreats by itself")?;
             if let Err((number, count)) = kind {
@@ -646,13 +664,16 @@ impl Reading<'_> {
 /// Converts a value to JSON: a number or Boolean if the text is a valid number or Boolean.
 fn json(node: &Node) -> serde_json::Value {
     match &node.kind {
-        Kind::Scalar(text) => serde_json::from_str(text)
-            .ok()
-            .filter(|value: &serde_json::Value| value.is_number() || value.is_boolean())
-            .unwrap_or_else(|| text.clone().into()),
+        Kind::Scalar(text) => plain(text),
         Kind::List(nodes) => nodes.iter().map(json).collect(),
         Kind::Map(_) | Kind::Null => serde_json::Value::Null,
     }
+}
+
+fn plain(text: &str) -> serde_json::Value {
+    let read: Option<serde_json::Value> = serde_json::from_str(text).ok();
+    read.filter(|value| value.is_number() || value.is_boolean())
+        .unwrap_or_else(|| text.into())
 }
 
 fn shortened(text: &str) -> String {

@@ -1,4 +1,5 @@
 use super::*;
+use crate::process::{BadEnd, Compare, Condition, Test};
 
 const EXAMPLE: &str = include_str!("../../../../examples/plant/mes.yaml");
 
@@ -90,4 +91,78 @@ fn a_step_names_the_component_that_does_it() {
         .render("mes.yaml", &wrong);
     let expected = "no earlier step is called `let go`; there are grip, hold";
     assert!(told.contains(expected), "{told}");
+}
+
+#[test]
+fn steps_have_an_order_conditions_and_a_time_limit() {
+    let text = "mes: m
+application_uri: urn:x
+namespace: 5
+processes:
+  - process: urn:p
+    steps:
+      - {step: fill, needs: {skill: urn:c:fill}}
+      - {step: heat, needs: {skill: urn:c:heat}, after: [], within: 7 s}
+      - {step: stir, needs: {skill: urn:c:stir}, after: [heat, fill]}
+      - step: drain
+        needs: {skill: urn:c:drain}
+        after: stir
+        when: [{of: fill, result: Level, is: '>= 20'}, {of: stir, ended: timed out, not: true}]
+      - {step: rinse, needs: {skill: urn:c:rinse}, when: {of: heat, result: Fault, is: false}}
+";
+    let settings = Settings::from_yaml(text, Path::new("")).unwrap();
+    let steps = &settings.processes[0].steps;
+    let waits = (0..)
+        .zip(steps)
+        .map(|(number, step)| step.after.clone().ok_or(number));
+    let waits: Vec<_> = waits.collect();
+    assert_eq!(
+        waits,
+        [Err(0), Ok(vec![]), Ok(vec![0, 1]), Ok(vec![2]), Err(4)]
+    );
+    assert_eq!(steps[1].within, Some(std::time::Duration::from_secs(7)));
+    let condition = |step, test, is_negated| Condition {
+        step,
+        test,
+        is_negated,
+    };
+    let level = Test::Result {
+        name: "Level".to_owned(),
+        compare: Compare::GreaterOrEqual,
+        value: 20.into(),
+    };
+    let both = vec![
+        condition(0, level, false),
+        condition(2, Test::Ended(BadEnd::TimedOut), true),
+    ];
+    assert_eq!(steps[3].when, [both]);
+    let fault = Test::Result {
+        name: "Fault".to_owned(),
+        compare: Compare::Equal,
+        value: false.into(),
+    };
+    assert_eq!(steps[4].when, [vec![condition(1, fault, false)]]);
+    for (right, wrong, why) in [
+        (
+            "after: stir",
+            "after: rinse",
+            "no earlier step is called `rinse`",
+        ),
+        ("ended: timed out", "ended: late", "`failed` or `timed out`"),
+        (
+            "result: Fault, is: false",
+            "result: Fault",
+            "`is` is missing",
+        ),
+        (
+            "result: Fault, is: false",
+            "ended: failed, is: 1",
+            "about a result or about an end",
+        ),
+    ] {
+        let wrong = text.replace(right, wrong);
+        let told = Settings::from_yaml(&wrong, Path::new("")).unwrap_err();
+        let told = told.render("mes.yaml", &wrong);
+        assert!(told.contains(why), "{told}");
+    }
 }
