@@ -8,7 +8,7 @@ use mtp::pea::{Pea, PeaFaults, PeaValue};
 use mtp::state::{Command, State};
 use mtp::{Module, Node};
 use program::Method;
-use skills::{Device, Outcome, Owner, Skill, Value};
+use skills::{Outcome, Owner, Skill, Value};
 
 use super::{ModuleNodes, ProcessModule, Settings, Timing};
 
