@@ -67,6 +67,7 @@ mod shaped;
 mod sharing;
 mod shipped_mappings;
 mod skills;
+mod small_device;
 mod space_verbs;
 mod space_write;
 mod telemetry;

@@ -1,6 +1,6 @@
 //! The builtin types of OPC UA, and their smaller values.
 
-use std::fmt;
+use core::fmt;
 
 /// Builtin type of a value, numbered as in the encoding byte of a Variant (OPC 10000-6, 5.1.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -2,6 +2,7 @@
 
 use crate::header_writer::{self, Extras, Form, PayloadHeader};
 use crate::{EncodeError, NetworkHeader, NetworkMessageType};
+use alloc::vec::Vec;
 
 /// A message to send in chunks: an encoded DataSetMessage, or the body of a discovery announcement.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -291,7 +291,7 @@ impl<'a> Iterator for FieldValues<'a> {
     }
 }
 
-impl std::iter::FusedIterator for FieldValues<'_> {}
+impl core::iter::FusedIterator for FieldValues<'_> {}
 
 impl FieldValue<'_> {
     /// Returns true for index 0 and a null Variant. open62541 1.5 pads delta frames with such
@@ -416,7 +416,7 @@ impl<'a> Iterator for Fields<'a> {
     }
 }
 
-impl std::iter::FusedIterator for Fields<'_> {}
+impl core::iter::FusedIterator for Fields<'_> {}
 
 /// The flags and the bytes of the header fields, which are checked for their length.
 #[derive(Debug, Clone, Copy)]

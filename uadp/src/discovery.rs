@@ -123,6 +123,7 @@ use crate::{
     DecodeError, EncodeError, NetworkHeader, NetworkMessage, NetworkMessageType, PublisherId,
     SecurityHeader,
 };
+use alloc::vec::Vec;
 
 /// Returns the payload of a discovery message that is neither sealed nor a chunk.
 fn read_payload<'a>(message: &NetworkMessage<'a>) -> Result<&'a [u8], DecodeError> {

@@ -6,6 +6,7 @@ use crate::field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
 use crate::header_writer::{self, Extras, Form, PayloadHeader};
 use crate::writer::flag;
 use crate::{DataSetHeader, EncodeError, NetworkHeader, NetworkMessageType, Seal, writer};
+use alloc::vec::Vec;
 
 /// Appends a NetworkMessage to a buffer (OPC 10000-14, 7.2.4.4.2).
 ///

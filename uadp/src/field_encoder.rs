@@ -3,6 +3,7 @@
 use crate::encoder::{Offsets, Progress};
 use crate::scalar::{BINARY_BODY, Scalar};
 use crate::{BuiltinType, DataValue, EncodeError, NodeId, Variant, variant, writer};
+use alloc::vec::Vec;
 
 /// Appends the fields of a key frame or event as Variants (OPC 10000-14, 7.2.4.5.5 and 7.2.4.5.7).
 ///

@@ -5,6 +5,7 @@ use crate::header::{
 };
 use crate::writer::{self, Room, flag};
 use crate::{EncodeError, Variant};
+use alloc::vec::Vec;
 
 /// Rarely used headers of NetworkMessages. The default has no such headers.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -24,6 +24,10 @@
 //! reuse their buffers. Counts and lengths are checked against the bytes that follow, nesting ends
 //! at [`MAX_NESTING`], and no datagram causes a panic.
 //!
+//! # Features
+//! Without the default feature `std`, the crate needs `alloc` only, for microcontrollers and other
+//! targets without an operating system. The types and functions are the same.
+//!
 //! # Reading
 //! ```
 //! use uadp::{NetworkMessage, PublisherId, Scalar, Variant};
@@ -67,6 +71,10 @@
 //! # Ok::<(), uadp::EncodeError>(())
 //! ```
 
+#![cfg_attr(not(any(feature = "std", test)), no_std)]
+
+extern crate alloc;
+
 pub mod action;
 mod builtin;
 mod chunk;
@@ -77,6 +85,7 @@ pub mod discovery;
 mod encoder;
 mod error;
 mod field_encoder;
+mod hashing;
 mod header;
 mod header_writer;
 mod nested;

@@ -1,7 +1,8 @@
 //! Values that contain values: DataValue, DiagnosticInfo, and nested Variants.
 
-use std::fmt;
-use std::marker::PhantomData;
+use alloc::vec::Vec;
+use core::fmt;
+use core::marker::PhantomData;
 
 use crate::reader::Reader;
 use crate::{DateTime, DecodeError, EncodeError, StatusCode, Variant, writer};

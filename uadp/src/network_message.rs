@@ -531,7 +531,7 @@ impl<'a> Messages<'a> {
     }
 }
 
-impl std::iter::FusedIterator for Messages<'_> {}
+impl core::iter::FusedIterator for Messages<'_> {}
 
 impl<'a> Iterator for PromotedFields<'a> {
     type Item = Result<Variant<'a>, DecodeError>;
@@ -548,7 +548,7 @@ impl<'a> Iterator for PromotedFields<'a> {
     }
 }
 
-impl std::iter::FusedIterator for PromotedFields<'_> {}
+impl core::iter::FusedIterator for PromotedFields<'_> {}
 
 /// Reads Count, which is never 0 (OPC 10000-14, 7.2.4.5.2), and DataSetWriterIds.
 #[inline]

@@ -2,6 +2,7 @@
 
 use crate::reader::Reader;
 use crate::{DecodeError, EncodeError, Guid, writer};
+use alloc::vec::Vec;
 
 /// NodeId (OPC 10000-6, 5.2.2.9). It is encoded in its shortest form, independent of the form it
 /// was decoded from.

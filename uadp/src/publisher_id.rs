@@ -1,6 +1,7 @@
 //! An owned PublisherId, independent of the datagram.
 
-use std::fmt;
+use alloc::boxed::Box;
+use core::fmt;
 
 use crate::PublisherId;
 

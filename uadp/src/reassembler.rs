@@ -2,8 +2,9 @@
 
 mod open;
 
-use std::collections::{BTreeMap, VecDeque};
-use std::time::Duration;
+use alloc::collections::{BTreeMap, VecDeque};
+use alloc::vec::Vec;
+use core::time::Duration;
 
 use crate::publisher_id::OwnedPublisherId;
 use crate::{
@@ -316,7 +317,7 @@ impl<S> Reassembler<S> {
     /// single chunk.
     #[must_use]
     pub fn take_whole(&mut self) -> Vec<u8> {
-        std::mem::take(&mut self.whole)
+        core::mem::take(&mut self.whole)
     }
 
     fn complete(&mut self, at: usize, now: Duration) -> Step {

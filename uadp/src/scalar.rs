@@ -4,6 +4,7 @@ use crate::nested::{self, DataValue, Depth, DiagnosticInfo, Encoded};
 use crate::node_id::{ExpandedNodeId, NodeId};
 use crate::reader::Reader;
 use crate::{BuiltinType, DateTime, DecodeError, EncodeError, Guid, StatusCode, Variant, writer};
+use alloc::vec::Vec;
 
 /// A single value, borrowed from its datagram.
 ///

@@ -4,6 +4,7 @@ use crate::nested::Depth;
 use crate::reader::Reader;
 use crate::scalar::Scalar;
 use crate::{BuiltinType, DecodeError, EncodeError, writer};
+use alloc::vec::Vec;
 
 /// Value of a field (OPC 10000-6, 5.2.2.16).
 #[derive(Debug, Clone, Copy, PartialEq)]

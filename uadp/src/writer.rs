@@ -1,6 +1,7 @@
 //! Appends to a buffer, and patches values that are known only at the end of a section.
 
 use crate::{BuiltinType, EncodeError};
+use alloc::vec::Vec;
 
 /// Space at the end of a buffer for a few small values. Checking the capacity for every value costs
 /// more.

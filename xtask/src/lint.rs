@@ -40,6 +40,14 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
             .cargo(workspace, &clippy)
             .args(["--", "-D", "warnings"]),
     )?;
+    // The codec must compile without the standard library.
+    let bare = ["clippy", "--package", "uadp", "--no-default-features"];
+    checks.run(
+        "uadp without std",
+        patched
+            .cargo(workspace, &bare)
+            .args(["--locked", "--", "-D", "warnings"]),
+    )?;
     checks.run(
         "documentation",
         patched

@@ -4,6 +4,7 @@ use super::{ActionDialect, ActionEncoding, ActionFields, ActionHeader, ActionSta
 use crate::encoder::{self, NetworkMessageEncoder};
 use crate::field_encoder::FieldEncoder;
 use crate::{DataSetHeader, EncodeError, Extras, NetworkHeader, Seal, data_set_message as message};
+use alloc::vec::Vec;
 
 /// Appends one NetworkMessage of requests or responses to a buffer (OPC 10000-14, 7.2.4.5.9 and
 /// 7.2.4.5.10).

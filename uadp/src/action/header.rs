@@ -1,6 +1,7 @@
 //! The ActionHeader, shared by all requests or responses of a NetworkMessage.
 
-use std::time::Duration;
+use alloc::vec::Vec;
+use core::time::Duration;
 
 use crate::reader::Reader;
 use crate::writer::{self, flag};

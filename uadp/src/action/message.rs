@@ -262,7 +262,7 @@ impl<'a> Iterator for Actions<'a> {
     }
 }
 
-impl std::iter::FusedIterator for Actions<'_> {}
+impl core::iter::FusedIterator for Actions<'_> {}
 
 impl ActionMessage<'_> {
     /// Returns target, request id and state.

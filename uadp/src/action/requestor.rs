@@ -1,7 +1,8 @@
 //! The Requestor: repeats each request until the Responder reacts, and ends each call.
 
-use std::collections::{BTreeMap, VecDeque};
-use std::time::Duration;
+use alloc::boxed::Box;
+use alloc::collections::{BTreeMap, VecDeque};
+use core::time::Duration;
 
 use super::sending::KeptFields;
 use super::timers::Timers;

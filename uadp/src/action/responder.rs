@@ -5,9 +5,9 @@ mod over;
 mod refused;
 mod settings;
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::hash::{DefaultHasher, Hash, Hasher};
-use std::time::Duration;
+use alloc::collections::{BTreeMap, BTreeSet};
+use core::hash::{Hash, Hasher};
+use core::time::Duration;
 
 use super::sending::KeptFields;
 use super::timers::Timers;
@@ -15,6 +15,7 @@ use super::{
     ActionDialect, ActionFields, ActionHeader, ActionKind, ActionMessage, ActionState,
     ActionToSend, Outcome, Refusal,
 };
+use crate::hashing::DefaultHasher;
 use crate::{OwnedPublisherId, StatusCode};
 use entry::{Entry, Key, Phase};
 use over::Over;
@@ -540,7 +541,7 @@ impl<P: Ord + Clone> Responder<P> {
         let execution = ExecutionId(id);
         let requested = match &mut entry.phase {
             Phase::Executing { abandoned, .. } => {
-                let first = !std::mem::replace(abandoned, true);
+                let first = !core::mem::replace(abandoned, true);
                 entry.answer(now, interval);
                 match first {
                     true => Requested::Abandoned(execution),
@@ -620,7 +621,7 @@ impl<P: Ord + Clone> Responder<P> {
     /// freed.
     fn closed(&mut self, id: u64) {
         if let Some(entry) = self.entries.get_mut(&id) {
-            let bytes = std::mem::take(&mut entry.answer_bytes);
+            let bytes = core::mem::take(&mut entry.answer_bytes);
             let origin = entry.origin.clone();
             self.account(&origin, |usage| {
                 usage.bytes -= bytes;

@@ -5,6 +5,8 @@ use super::{
     ActionStart, ActionState,
 };
 use crate::{DataSetHeader, EncodeError, Extras, GroupHeader, NetworkHeader, OwnedPublisherId};
+use alloc::boxed::Box;
+use alloc::vec::Vec;
 
 /// Address of an Action: its Responder and target (OPC 10000-14, 7.2.4.5.9).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -1,7 +1,7 @@
 //! Timers, ordered by time.
 
-use std::collections::BTreeSet;
-use std::time::Duration;
+use alloc::collections::BTreeSet;
+use core::time::Duration;
 
 /// A set with a timer per id.
 #[derive(Debug)]

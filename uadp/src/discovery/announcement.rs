@@ -11,6 +11,7 @@ use crate::{
     DateTime, DecodeError, EncodeError, LocalizedText, NetworkMessage, NetworkMessageType, NodeId,
     PublisherId, SecurityHeader, StatusCode,
 };
+use alloc::vec::Vec;
 
 /// A discovery announcement (OPC 10000-14, 7.2.4.6.3).
 ///

@@ -1,8 +1,9 @@
 //! Schedules the announcements of a Publisher: several probes share an announcement, and the rate
 //! is limited.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::time::Duration;
+use alloc::collections::{BTreeMap, BTreeSet, VecDeque};
+use alloc::vec::Vec;
+use core::time::Duration;
 
 use super::probe::Probe;
 
@@ -442,7 +443,7 @@ impl Announcer {
         };
         entry.earliest = now.saturating_add(SPACING);
         self.announced.insert((entry.earliest, subject));
-        std::mem::take(&mut entry.included)
+        core::mem::take(&mut entry.included)
     }
 
     /// Removes subjects that were announced long enough ago.

@@ -1,7 +1,8 @@
 //! Arrays of structures and values that are decoded element by element, or encoded from a slice.
 
-use std::fmt;
-use std::marker::PhantomData;
+use alloc::vec::Vec;
+use core::fmt;
+use core::marker::PhantomData;
 
 use super::wire::Structure;
 use crate::reader::Reader;
@@ -37,7 +38,7 @@ enum Step<'a, T> {
         reader: Reader<'a>,
         element: PhantomData<fn() -> T>,
     },
-    Slice(std::slice::Iter<'a, T>),
+    Slice(core::slice::Iter<'a, T>),
 }
 
 impl<'a, T> List<'a, T> {

@@ -8,6 +8,7 @@ use crate::{
     BuiltinType, ConfigurationVersion, DataSetHeader, DecodeError, EncodeError, Guid,
     LocalizedText, NodeId, QualifiedName,
 };
+use alloc::vec::Vec;
 
 structure! {
     /// The content of a DataSet (OPC 10000-14, 6.2.3.2.3).

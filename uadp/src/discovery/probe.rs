@@ -7,6 +7,7 @@ use crate::reader::Reader;
 use crate::{
     DecodeError, EncodeError, NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader,
 };
+use alloc::vec::Vec;
 
 /// A discovery probe (OPC 10000-14, 7.2.4.6.12).
 ///

@@ -1,6 +1,6 @@
 //! Schedules the probes of a Subscriber: after a random delay, and at increasing intervals.
 
-use std::time::Duration;
+use core::time::Duration;
 
 /// Timing of the probes for a piece of information that a Subscriber needs from a Publisher
 /// (OPC 10000-14, 7.2.4.6.12.2).

@@ -3,6 +3,7 @@
 use super::settings::Settings;
 use super::wire::structure;
 use crate::{Array, BuiltinType, DecodeError, EncodeError, LocalizedText, NodeId, Scalar, Variant};
+use alloc::vec::Vec;
 
 structure! {
     /// A unit of measure: the Property EngineeringUnits (OPC 10000-8, 5.6.4.3).

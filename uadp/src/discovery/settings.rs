@@ -3,6 +3,7 @@
 use super::list::List;
 use super::wire::{Structure, enumeration, read_all, structure};
 use crate::{DecodeError, EncodeError, ExtensionBody, ExtensionObject, NodeId};
+use alloc::vec::Vec;
 
 /// Settings of a transport or message mapping in an [`ExtensionObject`], decoded on demand.
 ///

@@ -6,6 +6,7 @@ use crate::{
     DateTime, DecodeError, EncodeError, ExtensionBody, ExtensionObject, Guid, LocalizedText,
     NodeId, QualifiedName, StatusCode, Variant,
 };
+use alloc::vec::Vec;
 
 /// A value with a fixed encoding: a builtin type, an array or a structure (OPC 10000-6, 5.2.6).
 pub(crate) trait Structure<'a>: Copy {
@@ -198,7 +199,7 @@ macro_rules! structure {
                 })
             }
 
-            fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), crate::EncodeError> {
+            fn write(&self, out: &mut alloc::vec::Vec<u8>, _: &'static str) -> Result<(), crate::EncodeError> {
                 $( crate::discovery::wire::Structure::write(
                     &self.$field,
                     out,
@@ -243,7 +244,7 @@ macro_rules! enumeration {
                 reader.i32(what).map(Self)
             }
 
-            fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), crate::EncodeError> {
+            fn write(&self, out: &mut alloc::vec::Vec<u8>, _: &'static str) -> Result<(), crate::EncodeError> {
                 out.extend_from_slice(&self.0.to_le_bytes());
                 Ok(())
             }

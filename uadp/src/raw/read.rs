@@ -13,7 +13,7 @@ use crate::{Array, DecodeError, ExtensionBody, ExtensionObject, Matrix, Scalar, 
 /// [`DecodeError::TrailingBytes`].
 #[derive(Debug, Clone)]
 pub struct RawFields<'a> {
-    fields: std::slice::Iter<'a, RawField<'a>>,
+    fields: core::slice::Iter<'a, RawField<'a>>,
     form: Form,
     reader: Reader<'a>,
 }
@@ -91,7 +91,7 @@ impl<'a> Iterator for RawFields<'a> {
 
     fn next(&mut self) -> Option<Self::Item> {
         let Some(field) = self.fields.next() else {
-            let padding = std::mem::replace(&mut self.reader, Reader::new(&[])).rest();
+            let padding = core::mem::replace(&mut self.reader, Reader::new(&[])).rest();
             return match padding.iter().all(|byte| *byte == 0) {
                 true => None,
                 false => Some(Err(DecodeError::TrailingBytes(padding.len()))),
@@ -106,7 +106,7 @@ impl<'a> Iterator for RawFields<'a> {
     }
 }
 
-impl std::iter::FusedIterator for RawFields<'_> {}
+impl core::iter::FusedIterator for RawFields<'_> {}
 
 impl<'a> RawStructure<'a> {
     /// Returns the fields of a body that was decoded as this structure.
@@ -153,7 +153,7 @@ impl<'a> Iterator for RawMembers<'a> {
     }
 }
 
-impl std::iter::FusedIterator for RawMembers<'_> {}
+impl core::iter::FusedIterator for RawMembers<'_> {}
 
 impl<'a> Walk<'a> {
     pub(super) fn new(
@@ -233,7 +233,7 @@ impl<'a> Walk<'a> {
     }
 
     fn step_union(&mut self) -> Result<Option<Member<'a>>, DecodeError> {
-        if std::mem::replace(&mut self.next, 1) != 0 {
+        if core::mem::replace(&mut self.next, 1) != 0 {
             return Ok(None);
         }
         let room = self.structure.union_room(self.form);

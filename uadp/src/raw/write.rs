@@ -8,6 +8,7 @@ use crate::reader::Reader;
 use crate::{
     Array, BuiltinType, DecodeError, ExtensionBody, ExtensionObject, Scalar, Variant, writer,
 };
+use alloc::vec::Vec;
 
 /// Reason why values were not encoded, and the field. The buffer is unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -214,7 +215,7 @@ fn write_field(
         RawValue::Variant(Variant::Null) => Ok(()),
         RawValue::Variant(Variant::Scalar(value)) => write_element(field, forms, value, buf),
         RawValue::Variant(Variant::Array(array)) => {
-            write_array(field, forms, &Items::Array(array), std::iter::empty(), buf)
+            write_array(field, forms, &Items::Array(array), core::iter::empty(), buf)
         }
         RawValue::Variant(Variant::Matrix(matrix)) => {
             let items = Items::Array(matrix.elements());

@@ -1,10 +1,13 @@
 //! An incomplete whole.
 
-use std::collections::BTreeMap;
-use std::hash::{DefaultHasher, Hasher};
-use std::time::Duration;
+use alloc::boxed::Box;
+use alloc::collections::BTreeMap;
+use alloc::vec::Vec;
+use core::hash::Hasher;
+use core::time::Duration;
 
 use super::{GiveUp, GivenUp};
+use crate::hashing::DefaultHasher;
 use crate::publisher_id::OwnedPublisherId;
 use crate::{Chunk, NetworkMessage, NetworkMessageType, PublisherId};
 

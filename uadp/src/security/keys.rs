@@ -1,6 +1,8 @@
 //! Keys of a SecurityTokenId, and the algorithms initialized with them.
 
-use std::fmt;
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use core::fmt;
 
 use aes::{Aes128Enc, Aes256Enc};
 use ctr::CtrCore;

@@ -1,6 +1,7 @@
 //! The receiving side: verifies messages, rejects replayed messages, decrypts payloads.
 
-use std::time::Duration;
+use alloc::vec::Vec;
+use core::time::Duration;
 
 use super::replay::{Accepted, StreamId, Streams};
 use super::ring::KeyRing;

@@ -1,6 +1,8 @@
 //! Detection of replayed messages.
 
-use std::time::Duration;
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use core::time::Duration;
 
 use super::{Nonce, OpenerOptions, SecurityError};
 use crate::PublisherId;

@@ -2,6 +2,7 @@
 //! keys.
 
 use super::{KeyError, Keys};
+use alloc::vec::Vec;
 
 /// Keys, each with a state that starts as its default and is removed with the key.
 #[derive(Debug)]

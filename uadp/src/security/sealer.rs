@@ -4,6 +4,7 @@ use super::ring::KeyRing;
 use super::{KeyError, Keys, MESSAGE_NONCE, Nonce, SealError, SecurityMode};
 use crate::reader::Reader;
 use crate::{EncodeError, NetworkMessage, SecurityHeader};
+use alloc::vec::Vec;
 
 /// Secures the messages that a Publisher sends to a SecurityGroup (OPC 10000-14, 7.2.4.4.3).
 ///

@@ -3,6 +3,7 @@
 use super::Seal;
 use crate::header::{EXTENDED_FLAGS1, SECURITY};
 use crate::{EncodeError, NetworkMessage};
+use alloc::vec::Vec;
 
 impl Seal<'_> {
     /// Maximum number of bytes that securing adds to a message without footer: ExtendedFlags1,

@@ -1,6 +1,7 @@
 //! A remembered request.
 
-use std::time::Duration;
+use alloc::boxed::Box;
+use core::time::Duration;
 
 use super::{KeptFields, RequestOrigin};
 use crate::action::{ActionAddress, ActionDialect, ActionFields, ActionMessage};
@@ -136,7 +137,7 @@ impl<P> Entry<P> {
         match &mut self.phase {
             Phase::Executing {
                 deadline, overdue, ..
-            } if now >= *deadline => !std::mem::replace(overdue, true),
+            } if now >= *deadline => !core::mem::replace(overdue, true),
             Phase::Executing { .. } | Phase::Done { .. } | Phase::Closed => false,
         }
     }

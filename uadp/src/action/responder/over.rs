@@ -1,11 +1,12 @@
 //! Finished requests: a hash of each, kept for as long as the network may delay a repetition.
 
-use std::collections::{BTreeMap, HashSet, VecDeque};
-use std::hash::{DefaultHasher, Hash, Hasher};
-use std::time::Duration;
+use alloc::collections::{BTreeMap, VecDeque};
+use core::hash::{Hash, Hasher};
+use core::time::Duration;
 
 use super::entry::Key;
 use super::{RequestDrop, RequestOrigin, ResponderSettings};
+use crate::hashing::{DefaultHasher, HashSet};
 
 /// Set of finished requests, each stored as the hash of its key. A hash collision among about
 /// 100000 requests is not expected; it would cause the second request to be dropped, not executed

@@ -1,8 +1,8 @@
 //! Requests that are refused before space is allocated. Enough of each is kept to repeat the
 //! refusal, and to execute no repetition even if the owner permits it by then.
 
-use std::collections::{HashMap, VecDeque};
-use std::time::Duration;
+use alloc::collections::VecDeque;
+use core::time::Duration;
 
 use super::entry::Key;
 use super::over::{Counts, hash};
@@ -12,6 +12,7 @@ use crate::action::{
     ActionAddress, ActionDialect, ActionFields, ActionHeader, ActionKind, ActionMessage,
     ActionState, ActionToSend, Refusal,
 };
+use crate::hashing::HashMap;
 
 /// Refused requests, by the hash of their key.
 #[derive(Debug)]

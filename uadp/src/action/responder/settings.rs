@@ -1,6 +1,6 @@
 //! Limits of a Responder, and its decisions on requests.
 
-use std::time::Duration;
+use core::time::Duration;
 
 use crate::action::Refusal;
 
