@@ -431,3 +431,30 @@ fn each_copy_of_an_event_is_sealed_anew_under_a_nonce_of_its_own() {
     assert_eq!(nonces.len(), copies.len());
     assert_eq!(cell.texts(READER, said()), ["stop"]);
 }
+
+const COMMAND: &str = "
+security: [{group: cell, keys: {file: k}}]
+namespaces: {7: urn:cell}
+spaces: [{id: 1}]
+variables:
+  - {node: ns=7;i=10, name: Stop, origin: 0, ros: {space: 1, topic: /stop, type: std_msgs/String}}
+";
+
+#[test]
+fn the_repetitions_of_a_sealed_command_have_the_time_of_its_first_transmission() {
+    for (yaml, is_kept) in [(COMMAND, true), (ENCRYPTED, false)] {
+        let mut cell = secured(yaml);
+        cell.say(WRITER, said(), "stop");
+        cell.run(ms(200));
+        let mut times = Vec::new();
+        for datagram in cell.datagrams_of(WRITER) {
+            let message = NetworkMessage::decode(&datagram).unwrap();
+            if message.message_type() == uadp::NetworkMessageType::DataSet {
+                times.push(message.header().timestamp.unwrap());
+            }
+        }
+        assert!(times.len() >= 3, "{}", times.len());
+        times.dedup();
+        assert_eq!(times.len() == 1, is_kept, "{times:?}");
+    }
+}

@@ -17,10 +17,11 @@ impl Values {
     /// the mapping allows it.
     pub(super) fn datagram(&mut self, at: Handle, mut first: Encoded, now: Now) -> Option<Output> {
         let topic = at.topic();
-        // Each topic of a broker has its own messages.
-        let others = match self.relay {
-            None => self.gather(topic, &first),
-            Some(_) => Vec::new(),
+        // Each topic of a broker has its own messages. A message of several writers has the time of
+        // its transmission.
+        let others = match self.relay.is_some() || self.keeps_time(at) {
+            false => self.gather(topic, &first),
+            true => Vec::new(),
         };
         let with = others.iter().map(|(topic, _)| *topic).collect();
         if others.is_empty() {
@@ -56,6 +57,7 @@ impl Values {
     /// Other topics keep their position.
     fn gather(&mut self, topic: TopicId, first: &Encoded) -> Vec<(TopicId, Encoded)> {
         let mut gathered = Vec::new();
+        let seals = self.seals();
         let pubsub = self.mapping.pubsub();
         let most = usize::from(pubsub.messages_per_datagram);
         let room = usize::from(pubsub.max_datagram)
@@ -75,7 +77,9 @@ impl Values {
                 continue;
             };
             let is_alone = entry.overflow == Overflow::KeepLatest;
-            let joins = next.topic().triple().1 == topic.triple().1
+            let keeps_time = seals && entry.confirming.is_some();
+            let joins = !keeps_time
+                && next.topic().triple().1 == topic.triple().1
                 && !(is_alone && is_in(next.topic(), topic, &gathered));
             let before = entry.counters.repeated;
             let taken = match joins {

@@ -57,10 +57,17 @@ impl Router {
 
 impl Values {
     /// Returns whether the repetitions of a value carry the time of its first transmission. A
-    /// broker could deliver a repetition after the command was given up.
+    /// broker could deliver a repetition after the command was given up. A program that forwards
+    /// sealed messages to a broker cannot recognise repetitions.
     pub(super) fn keeps_time(&self, at: Handle) -> bool {
         let is_command = |entry: &Topic| entry.confirming.is_some();
-        self.relay.is_some() && self.topics.at(at).is_some_and(is_command)
+        let is_stored = self.relay.is_some() || self.seals();
+        is_stored && self.topics.at(at).is_some_and(is_command)
+    }
+
+    /// Returns whether messages of a group are sealed.
+    pub(super) const fn seals(&self) -> bool {
+        self.overhead > 0
     }
 
     /// Returns the headers of a request or a response. Over a broker they contain the time of
