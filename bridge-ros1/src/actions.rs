@@ -183,7 +183,7 @@ impl Unsent {
 impl ActionClient for Sender {
     type Goal = Sent;
 
-    fn send_goal(&self, id: GoalId, body: &[u8]) -> Sent {
+    fn send_goal(&self, id: GoalId, body: &[u8], start_by: std::time::Instant) -> Sent {
         self.unsent.lock().insert(id, false);
         let mut goal = Sent {
             client: Arc::clone(&self.client),
@@ -193,6 +193,7 @@ impl ActionClient for Sender {
             stage: Stage::Waiting {
                 body: Bytes::copy_from_slice(body),
                 until: after(self.waits.answer.min(CONNECTS)),
+                start_by,
             },
             accepted: false,
             undecided: None,
@@ -258,6 +259,8 @@ enum Stage {
     Waiting {
         body: Bytes,
         until: Instant,
+        /// The time after which the goal is not sent.
+        start_by: std::time::Instant,
     },
     Sent(GoalHandle),
     Ended,
@@ -303,12 +306,19 @@ impl Drop for Sent {
 
 impl Sent {
     fn send(&mut self) {
-        let Stage::Waiting { body, .. } = std::mem::replace(&mut self.stage, Stage::Ended) else {
+        let stage = std::mem::replace(&mut self.stage, Stage::Ended);
+        let Stage::Waiting { body, start_by, .. } = stage else {
             return;
         };
         if self.unsent.take(self.id) {
             return self.lose(
                 "the goal was withdrawn before it was sent".to_owned(),
+                Ran::No,
+            );
+        }
+        if bridge_node::now().monotonic > start_by {
+            return self.lose(
+                "the goal was not sent: the time until which it may start has passed".to_owned(),
                 Ran::No,
             );
         }

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, ServiceGraph};
 use bytes::Bytes;
@@ -141,10 +141,10 @@ impl ServiceCall for Executor {
         self.kept.service()
     }
 
-    async fn call(&self, request: Bytes) -> Result<Bytes, CallFault> {
+    async fn call_by(&self, request: Bytes, start_by: Option<Instant>) -> Result<Bytes, CallFault> {
         match self.turn.try_lock() {
-            Ok(_turn) => self.kept.call(request).await,
-            Err(_) => self.more.call(request).await,
+            Ok(_turn) => self.kept.call_by(request, start_by).await,
+            Err(_) => self.more.call_by(request, start_by).await,
         }
     }
 }
@@ -175,10 +175,11 @@ impl ServiceCall for Client {
         self.client.requests_sent() > self.sent_before.load(Ordering::Relaxed)
     }
 
-    async fn call(&self, request: Bytes) -> Result<Bytes, CallFault> {
+    async fn call_by(&self, request: Bytes, start_by: Option<Instant>) -> Result<Bytes, CallFault> {
         let before = self.client.requests_sent();
         self.sent_before.store(before, Ordering::Relaxed);
-        self.client.call(request).await.map_err(|error| CallFault {
+        let called = self.client.call_by(request, start_by.map(Into::into)).await;
+        called.map_err(|error| CallFault {
             text: error.to_string(),
             may_pass: may_pass(&error),
             ran: if matches!(error, ServiceError::Failed { .. }) {

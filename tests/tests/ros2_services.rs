@@ -15,6 +15,7 @@ use ros2_node::service::{
 };
 use serde_json::json;
 use system_tests::{Cell, Peer};
+use tokio::time::Instant;
 
 use peer::{DONE, Ours, SET_BOOL, SOON, Vendor, cyclone_calls, cyclone_serves, until};
 
@@ -428,4 +429,25 @@ async fn a_server_of_ours_says_when_it_knows_a_client() {
     assert_eq!(client.servers(), 1);
     drop(server);
     until("it is gone", || client.servers() + client.acquainted() == 0).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_request_is_not_sent_to_a_server_that_comes_after_its_time() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    let (ours, others) = (Ours::join(), Ours::join());
+    let client = client(&ours, within(SOON));
+    let start_by = Instant::now() + Duration::from_millis(100);
+    let late = tokio::spawn({
+        let client = client.clone();
+        async move { client.call_by(set(true), Some(start_by)).await }
+    });
+    until("its time has passed", || Instant::now() > start_by).await;
+    let server = server(&others, ServiceOptions::default());
+    let error = late.await.unwrap().unwrap_err();
+    assert!(matches!(error, ServiceError::TooLate { .. }), "{error}");
+    assert!(!error.may_have_run());
+    assert_eq!(client.call(set(true)).await.unwrap(), DONE);
+    assert_eq!(server.counters().calls, 1);
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_node::actions::{
     ActionClient as Sends, ActionGraph, ActionServer as Takes, CancelAnswer, CancelRequest,
@@ -104,8 +104,9 @@ pub(super) struct Client(action::ActionClient);
 impl Sends for Client {
     type Goal = Goal;
 
-    fn send_goal(&self, id: GoalId, body: &[u8]) -> Goal {
-        match self.0.send_goal_as(action::GoalId::from_bytes(id), body) {
+    fn send_goal(&self, id: GoalId, body: &[u8], start_by: Instant) -> Goal {
+        let id = action::GoalId::from_bytes(id);
+        match self.0.send_goal_by(id, body, Some(start_by.into())) {
             Ok(handle) => Goal::Sent(handle),
             Err(in_use) => Goal::NotSent(Some(in_use.to_string())),
         }

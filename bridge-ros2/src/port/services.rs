@@ -2,7 +2,7 @@
 //! offered as services.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, ServiceGraph};
 use bytes::Bytes;
@@ -181,8 +181,8 @@ impl ServiceCall for Client {
         self.under_way().is_sent()
     }
 
-    async fn call(&self, request: Bytes) -> Result<Bytes, CallFault> {
-        let under_way = Recall::default();
+    async fn call_by(&self, request: Bytes, start_by: Option<Instant>) -> Result<Bytes, CallFault> {
+        let under_way = Recall::after(start_by.map(Into::into));
         *self.under_way() = under_way.clone();
         let call = self.client.call_recallable(request, None, &under_way);
         let replied = call.await.map(|replied| replied.reply);

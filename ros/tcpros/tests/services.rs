@@ -169,7 +169,11 @@ async fn read_header(stream: &mut TcpStream) -> ConnectionHeader {
 
 /// Accepts a client as a hand-made server, up to its first request.
 async fn accept(listener: &TcpListener) -> (TcpStream, ConnectionHeader) {
-    let (mut stream, _) = within("a client", listener.accept()).await.unwrap();
+    let (stream, _) = within("a client", listener.accept()).await.unwrap();
+    greet(stream).await
+}
+
+async fn greet(mut stream: TcpStream) -> (TcpStream, ConnectionHeader) {
     let header = read_header(&mut stream).await;
     let reply = ConnectionHeader::default()
         .with("callerid", "/by_hand")
@@ -602,6 +606,44 @@ async fn a_call_given_up_halfway_leaves_nothing_to_the_next() {
     assert!(timeout(Duration::from_millis(200), hanging).await.is_err());
     assert_eq!(ask(&client, "off").await.unwrap(), "off");
     assert_eq!(server.bytes_received(), 2 + 4 + 3);
+}
+
+#[tokio::test]
+async fn a_request_is_not_sent_after_the_time_until_which_it_may_start() {
+    let core = core();
+    let cell = node("cell", &core);
+    let listener = server_by_hand(&core, "/grip").await;
+    for client in [client(&cell, "/grip"), persistent(&cell, "/grip")] {
+        let soon = Instant::now() + Duration::from_millis(100);
+        let calling = client.call_by(Bytes::from_static(b"on"), Some(soon));
+        let serving = async {
+            let (stream, _) = within("a client", listener.accept()).await.unwrap();
+            // The server accepts the connection header only when the time has passed.
+            tokio::time::sleep_until(soon + Duration::from_millis(1)).await;
+            let mut stream = greet(stream).await.0;
+            let mut rest = Vec::new();
+            within("the end", stream.read_to_end(&mut rest))
+                .await
+                .unwrap();
+            rest
+        };
+        let (called, received) = tokio::join!(calling, serving);
+        let error = called.unwrap_err();
+        assert!(matches!(error, ServiceError::TooLate { .. }), "{error}");
+        assert!(!error.may_have_run());
+        assert_eq!(received, b"");
+        let later = Instant::now() + DEADLINE;
+        let calling = client.call_by(Bytes::from_static(b"off"), Some(later));
+        let serving = async {
+            let (mut stream, _) = accept(&listener).await;
+            let request = take_request(&mut stream).await;
+            stream.write_all(b"\x01\x02\0\0\0ok").await.unwrap();
+            request
+        };
+        let (called, received) = tokio::join!(calling, serving);
+        assert_eq!(called.unwrap(), "ok");
+        assert_eq!(received, b"off");
+    }
 }
 
 #[tokio::test]

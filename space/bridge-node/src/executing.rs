@@ -267,8 +267,10 @@ async fn run<C: ServiceCall + Sync>(
     (execution, request, start_by): (ExecutionId, Bytes, Instant),
     (report, place): (mpsc::OwnedPermit<Done>, OwnedSemaphorePermit),
 ) {
+    // Compared here for all clients, and again by the client when it sends the request: it may have
+    // to look the service up and to connect before.
     let result = match now().monotonic <= start_by {
-        true => client.call(request).await,
+        true => client.call_by(request, Some(start_by)).await,
         false => Err(CallFault {
             text: TOO_LATE.to_owned(),
             may_pass: true,

@@ -9,7 +9,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_node::policy::Policy;
 use bridge_node::{
@@ -44,7 +44,7 @@ impl ServiceCall for NoClient {
         "/none"
     }
 
-    async fn call(&self, _: Bytes) -> Result<Bytes, CallFault> {
+    async fn call_by(&self, _: Bytes, _: Option<Instant>) -> Result<Bytes, CallFault> {
         std::future::pending().await
     }
 }

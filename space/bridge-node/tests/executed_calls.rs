@@ -4,7 +4,7 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_node::policy::Policy;
 use bridge_node::{
@@ -34,7 +34,7 @@ impl ServiceCall for Client {
         &self.0
     }
 
-    async fn call(&self, _: Bytes) -> Result<Bytes, CallFault> {
+    async fn call_by(&self, _: Bytes, _: Option<Instant>) -> Result<Bytes, CallFault> {
         self.1.acquire().await.unwrap().forget();
         let answer = self.2.lock().unwrap().pop_front();
         answer.unwrap_or_else(|| Ok(Bytes::from_static(b"done")))

@@ -248,8 +248,8 @@ impl Shared {
         }
     }
 
-    /// Drives a goal to its end.
-    pub(super) async fn drive(self: Arc<Self>, id: GoalId, request: Bytes) {
+    /// Drives a goal to its end. Its request is not sent after the time, if any.
+    pub(super) async fn drive(self: Arc<Self>, id: GoalId, request: (Bytes, Option<Instant>)) {
         let changed = self.lock().goals.changed(id);
         // Both branches are cancel-safe: a cancel request is recorded as sent before it is sent.
         let outcome = tokio::select! {
@@ -295,7 +295,7 @@ impl Shared {
         state.tasks.remove(&id);
     }
 
-    async fn outcome(&self, id: GoalId, request: Bytes) -> Outcome {
+    async fn outcome(&self, id: GoalId, request: (Bytes, Option<Instant>)) -> Outcome {
         let found = tokio::select! {
             biased;
             () = self.until(id, ClientGoals::is_withdrawn) => return Outcome::Lost(LostReason::Withdrawn),
@@ -334,8 +334,12 @@ impl Shared {
     /// Sends the goal and waits until it is accepted: by the reply, which names an endpoint of the
     /// server, or by the status of the server, because the reply can be lost. Otherwise returns the
     /// outcome of the goal.
-    async fn decision(&self, id: GoalId, request: Bytes) -> Result<Option<GUID>, Outcome> {
-        let recall = Recall::default();
+    async fn decision(
+        &self,
+        id: GoalId,
+        (request, start_by): (Bytes, Option<Instant>),
+    ) -> Result<Option<GUID>, Outcome> {
+        let recall = Recall::after(start_by);
         let send = &self.asked.send;
         let mut asked = pin!(send.call_recallable(request, None, &recall));
         let mut overdue = pin!(after(self.options.answer_timeout));

@@ -78,7 +78,7 @@ impl ActionClient {
     #[must_use]
     pub fn send_goal(&self, body: &[u8]) -> GoalHandle {
         let id = self.shared.new_id();
-        self.send_new(self.shared.lock(), id, body)
+        self.send_new(self.shared.lock(), id, (body, None))
     }
 
     /// Sends a goal as [`send_goal`](Self::send_goal) does, with an id chosen by the caller. A
@@ -87,20 +87,39 @@ impl ActionClient {
     /// # Errors
     /// [`IdInUse`] while a handle for a goal with this id exists: nothing is sent.
     pub fn send_goal_as(&self, id: GoalId, body: &[u8]) -> Result<GoalHandle, IdInUse> {
+        self.send_goal_by(id, body, None)
+    }
+
+    /// Sends a goal as [`send_goal_as`](Self::send_goal_as) does, but not after `start_by`. A goal
+    /// that is not sent in time is lost, and does not run.
+    ///
+    /// # Errors
+    /// [`IdInUse`] while a handle for a goal with this id exists: nothing is sent.
+    pub fn send_goal_by(
+        &self,
+        id: GoalId,
+        body: &[u8],
+        start_by: Option<Instant>,
+    ) -> Result<GoalHandle, IdInUse> {
         let state = self.shared.lock();
         if state.goals.is_held(id) {
             return Err(IdInUse(id));
         }
-        Ok(self.send_new(state, id, body))
+        Ok(self.send_new(state, id, (body, start_by)))
     }
 
-    fn send_new(&self, mut state: MutexGuard<'_, State>, id: GoalId, body: &[u8]) -> GoalHandle {
+    fn send_new(
+        &self,
+        mut state: MutexGuard<'_, State>,
+        id: GoalId,
+        (body, start_by): (&[u8], Option<Instant>),
+    ) -> GoalHandle {
         let wake: Arc<Notify> = Arc::default();
         state.goals.sent(id, Arc::clone(&wake));
         match wire::join(id, body) {
             None => drop(state.goals.end(id, Outcome::Lost(LostReason::Message))),
             Some(request) if state.goals.outcome(id).is_none() => {
-                let task = tokio::spawn(Arc::clone(&self.shared).drive(id, request));
+                let task = tokio::spawn(Arc::clone(&self.shared).drive(id, (request, start_by)));
                 state.tasks.insert(id, task.abort_handle());
             }
             Some(_) => {}

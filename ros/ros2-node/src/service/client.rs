@@ -166,7 +166,21 @@ impl ServiceClient {
     /// # Errors
     /// [`ServiceError`].
     pub async fn call(&self, request: Bytes) -> Result<Bytes, ServiceError> {
-        let answer = self.call_after(request, None).await?;
+        self.call_by(request, None).await
+    }
+
+    /// Calls as [`call`](Self::call) does, but never sends the request after `start_by`. The call
+    /// then ends with [`ServiceError::TooLate`], when it would be sent.
+    ///
+    /// # Errors
+    /// [`ServiceError`].
+    pub async fn call_by(
+        &self,
+        request: Bytes,
+        start_by: Option<Instant>,
+    ) -> Result<Bytes, ServiceError> {
+        let recall = Recall::after(start_by);
+        let answer = self.call_recallable(request, None, &recall).await?;
         Ok(answer.reply)
     }
 
@@ -191,13 +205,14 @@ impl ServiceClient {
         &self,
         request: Bytes,
         endpoint: Option<GUID>,
-        Recall(phase): &Recall,
+        Recall { phase, start_by }: &Recall,
     ) -> Result<Replied, ServiceError> {
         let (done, reply) = oneshot::channel();
         let call = Call {
             request,
             companion: endpoint.map(|endpoint| (endpoint, Instant::now() + COMPANION)),
             phase: Arc::clone(phase),
+            start_by: *start_by,
             done,
         };
         let at = || CallPhase::from(phase.load(Ordering::Relaxed));
@@ -233,6 +248,7 @@ impl ServiceClient {
                 theirs,
                 ours: self.shared.service.types.request.clone(),
             },
+            Failure::TooLate => ServiceError::TooLate { service },
             Failure::Lost => ServiceError::Lost { service },
             Failure::Closed => ServiceError::Closed { service, phase },
         }
@@ -241,28 +257,44 @@ impl ServiceClient {
 
 /// Recalls a request that was not sent yet.
 #[derive(Debug, Clone)]
-pub struct Recall(Arc<AtomicU8>);
+pub struct Recall {
+    phase: Arc<AtomicU8>,
+    /// The time after which the request is not sent.
+    start_by: Option<Instant>,
+}
 
 impl Default for Recall {
     fn default() -> Self {
-        Self(Arc::new(AtomicU8::new(CallPhase::Queue.into())))
+        Self {
+            phase: Arc::new(AtomicU8::new(CallPhase::Queue.into())),
+            start_by: None,
+        }
     }
 }
 
 impl Recall {
+    /// Returns a handle of a request that is not sent after `start_by`.
+    #[must_use]
+    pub fn after(start_by: Option<Instant>) -> Self {
+        Self {
+            start_by,
+            ..Self::default()
+        }
+    }
+
     /// Returns whether the request was sent.
     #[must_use]
     pub fn is_sent(&self) -> bool {
-        self.0.load(Ordering::Acquire) == u8::from(CallPhase::Answer)
+        self.phase.load(Ordering::Acquire) == u8::from(CallPhase::Answer)
     }
 
     /// Prevents the request from being sent. Returns false if it was sent or is being sent.
     pub fn recall(&self) -> bool {
         let before = |phase: u8| (phase < CallPhase::Request.into()).then_some(RECALLED);
         let moved = self
-            .0
+            .phase
             .fetch_update(Ordering::AcqRel, Ordering::Acquire, before);
-        moved.is_ok() || self.0.load(Ordering::Acquire) == RECALLED
+        moved.is_ok() || self.phase.load(Ordering::Acquire) == RECALLED
     }
 }
 
@@ -282,6 +314,8 @@ struct Call {
     /// this.
     companion: Option<(GUID, Instant)>,
     phase: Arc<AtomicU8>,
+    /// The time after which the request is not sent.
+    start_by: Option<Instant>,
     done: oneshot::Sender<Result<Replied, Failure>>,
 }
 
@@ -293,6 +327,13 @@ impl Call {
             .phase
             .fetch_update(Ordering::AcqRel, Ordering::Acquire, moved);
         entered.is_ok()
+    }
+
+    /// Returns whether the request must not be sent any more. Reads the clock itself, because the
+    /// process may not have run for a while.
+    fn is_late(&self) -> bool {
+        self.start_by
+            .is_some_and(|start_by| Instant::now() > start_by)
     }
 
     /// Returns whether to send the request to these servers at `now`.
@@ -317,6 +358,7 @@ enum Failure {
     Busy,
     Request(&'static str),
     OtherType(String),
+    TooLate,
     Lost,
     Closed,
 }
@@ -452,6 +494,10 @@ impl Driver {
         {
             if call.done.is_closed() || !call.enter(CallPhase::Request) {
                 // The caller abandoned the call.
+                continue;
+            }
+            if call.is_late() {
+                call.end(Err(Failure::TooLate));
                 continue;
             }
             if let Some(unsent) = self.ask(call, &servers, now) {

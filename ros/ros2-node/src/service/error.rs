@@ -68,6 +68,12 @@ pub enum ServiceError {
         /// The timeout of the whole call.
         limit: Duration,
     },
+    /// The time until which the request could be sent has passed before it was sent.
+    #[error("the request for {service} was not sent: the time until which it may start has passed")]
+    TooLate {
+        /// The service.
+        service: String,
+    },
     /// Every server that received the request has left or its lease has expired.
     #[error("the servers of {service} left the domain before they responded")]
     Lost {
@@ -126,7 +132,10 @@ impl ServiceError {
                 matches!(phase, CallPhase::Answer)
             }
             Self::Lost { .. } | Self::Reply { .. } => true,
-            Self::OtherType { .. } | Self::Busy { .. } | Self::Request { .. } => false,
+            Self::OtherType { .. }
+            | Self::Busy { .. }
+            | Self::TooLate { .. }
+            | Self::Request { .. } => false,
         }
     }
 }

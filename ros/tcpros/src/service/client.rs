@@ -1,7 +1,7 @@
 //! Calling a service: lookup, connection, request, response and errors.
 
 use std::fmt;
-use std::io;
+use std::io::{self, IoSlice};
 use std::mem::MaybeUninit;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -127,6 +127,17 @@ impl ServiceClient {
     /// whether the server may have executed the call. Dropping the future aborts the call and
     /// closes its connection; the server may still execute the call.
     pub async fn call(&self, request: Bytes) -> Result<Bytes, ServiceError> {
+        self.call_by(request, None).await
+    }
+
+    /// Calls as [`call`](Self::call) does. After `start_by`, no byte of the request is sent any
+    /// more, so the call ends with [`ServiceError::TooLate`] unless the server has the whole
+    /// request.
+    pub async fn call_by(
+        &self,
+        request: Bytes,
+        start_by: Option<Instant>,
+    ) -> Result<Bytes, ServiceError> {
         let length = u32::try_from(request.len()).map_err(|_| ServiceError::RequestTooLong {
             service: self.service().to_owned(),
             bytes: request.len(),
@@ -134,6 +145,7 @@ impl ServiceClient {
         let wire = Wire {
             length: length.to_le_bytes(),
             request,
+            start_by,
         };
         let deadline = self.shared.deadline();
         // The futures are large: they are boxed to keep them out of the caller's future.
@@ -163,6 +175,44 @@ enum Purpose {
 struct Wire {
     length: [u8; 4],
     request: Bytes,
+    /// The time after which nothing of it is sent.
+    start_by: Option<Instant>,
+}
+
+impl Wire {
+    /// Sends the request. The time is compared directly before each write, because the process may
+    /// not have run for a while. A request that was sent in part does not reach the service: the
+    /// connection is closed.
+    async fn send(&self, stream: &TcpStream) -> Result<(), SendError> {
+        let mut data = Buf::chain(self.length.as_slice(), &*self.request);
+        while data.has_remaining() {
+            stream.writable().await?;
+            if self
+                .start_by
+                .is_some_and(|start_by| clock::now() > start_by)
+            {
+                return Err(SendError::TooLate);
+            }
+            let mut parts = [IoSlice::new(&[]), IoSlice::new(&[])];
+            let filled = data.chunks_vectored(&mut parts);
+            match stream.try_write_vectored(parts.get(..filled).unwrap_or(&parts)) {
+                Ok(0) => return Err(io::Error::from(io::ErrorKind::WriteZero).into()),
+                Ok(written) => data.advance(written),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The reason why a request was not sent as a whole.
+#[derive(Debug, Error)]
+enum SendError {
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    #[error("too late")]
+    TooLate,
 }
 
 impl Shared {
@@ -315,11 +365,14 @@ impl Shared {
         deadline: Instant,
     ) -> Result<Bytes, ServiceError> {
         connection.sound = false;
-        let mut data = Buf::chain(wire.length.as_slice(), wire.request.clone());
-        let writing = connection.stream.write_all_buf(&mut data);
-        self.within(CallPhase::Request, deadline, writing)
-            .await?
-            .map_err(|source| self.lost(CallPhase::Request, source))?;
+        let sending = wire.send(&connection.stream);
+        let sent = self.within(CallPhase::Request, deadline, sending).await?;
+        sent.map_err(|error| match error {
+            SendError::Io(source) => self.lost(CallPhase::Request, source),
+            SendError::TooLate => ServiceError::TooLate {
+                service: self.service.clone(),
+            },
+        })?;
         self.sent.fetch_add(1, Ordering::Relaxed);
         let reading = connection.answer(self.options.max_response);
         let phase = CallPhase::Answer;
@@ -564,6 +617,12 @@ pub enum ServiceError {
         /// The time limit of the whole call.
         limit: Duration,
     },
+    /// The time until which the request could be sent has passed before it was sent.
+    #[error("the request for {service} was not sent: the time until which it may start has passed")]
+    TooLate {
+        /// The resolved service.
+        service: String,
+    },
     /// The connection ended within the call.
     #[error("the connection to the server of {service} was lost while {phase}: {source}")]
     Lost {
@@ -621,6 +680,7 @@ impl ServiceError {
             | Self::Refused { .. }
             | Self::OtherType { .. }
             | Self::Failed { .. }
+            | Self::TooLate { .. }
             | Self::RequestTooLong { .. } => false,
         }
     }

@@ -4,7 +4,7 @@
 //! in little endian with the encapsulation header.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use messages::{ActionCalls, TypeName};
@@ -119,9 +119,10 @@ pub trait ActionClient: Send + Sync + 'static {
     /// A goal that was sent.
     type Goal: SentGoal;
 
-    /// Sends a goal, an `X_Goal`, with an id. Never waits: the returned goal reports the events.
-    /// Called on a tokio runtime.
-    fn send_goal(&self, id: GoalId, body: &[u8]) -> Self::Goal;
+    /// Sends a goal, an `X_Goal`, with an id. Never waits: the returned goal reports the events. A
+    /// goal that cannot be sent until `start_by` is lost, and never runs. Called on a tokio
+    /// runtime.
+    fn send_goal(&self, id: GoalId, body: &[u8], start_by: Instant) -> Self::Goal;
 
     /// Requests the server to cancel goals. Ends within [`Waits::answer`]. A goal that the server
     /// has not decided about is withdrawn: it is not sent, or is cancelled as soon as it is

@@ -165,7 +165,10 @@ impl<C: ActionClient> Serving<C> {
 
     async fn ask_goal(&mut self, execution: Execution) -> Result<(), Over> {
         let Execution {
-            id: run, request, ..
+            id: run,
+            request,
+            start_by,
+            ..
         } = execution;
         let Some((id, body)) = self.action.encoding.split(&request) else {
             return self.refuse(run, Refusal::InvalidArgument).await;
@@ -176,7 +179,7 @@ impl<C: ActionClient> Serving<C> {
         };
         match self.goals.ask(id, run) {
             Asked::Send => {
-                let goal = self.client.send_goal(id, &body);
+                let goal = self.client.send_goal(id, &body, start_by);
                 self.tasks.spawn(follow(id, goal, self.tell.clone()));
                 Ok(())
             }

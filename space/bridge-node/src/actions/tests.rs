@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::sync::Mutex;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bridge_core::{
     AskError, AskErrorKind, AskId, CallField, CallRole, Executed, Kept, OfferedType,
@@ -57,7 +57,7 @@ impl ServiceCall for Never {
         ""
     }
 
-    async fn call(&self, _: Bytes) -> Result<Bytes, CallFault> {
+    async fn call_by(&self, _: Bytes, _: Option<Instant>) -> Result<Bytes, CallFault> {
         std::future::pending().await
     }
 }
@@ -134,7 +134,7 @@ impl SentGoal for Heard {
 impl ActionClient for Client {
     type Goal = Heard;
 
-    fn send_goal(&self, id: GoalId, body: &[u8]) -> Heard {
+    fn send_goal(&self, id: GoalId, body: &[u8], _: Instant) -> Heard {
         let (say, heard) = mpsc::channel(16);
         let body = Bytes::copy_from_slice(body);
         self.sent.try_send(Sent { id, body, say }).ok().unwrap();

@@ -2,7 +2,7 @@
 
 use std::pin::pin;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use mappings::TopicId;
@@ -17,11 +17,16 @@ pub trait ServiceCall: Send + 'static {
     /// Returns the name of the service in the graph.
     fn service(&self) -> &str;
 
-    /// Calls the service. Request and response are in the wire format of the ROS.
+    /// Calls the service. Request and response are in the wire format of the ROS. The request is
+    /// not sent after `start_by`, which is compared directly before it is sent.
     ///
     /// # Errors
     /// [`CallFault`]; a call ends in bounded time.
-    fn call(&self, request: Bytes) -> impl Future<Output = Result<Bytes, CallFault>> + Send;
+    fn call_by(
+        &self,
+        request: Bytes,
+        start_by: Option<Instant>,
+    ) -> impl Future<Output = Result<Bytes, CallFault>> + Send;
 
     /// Returns whether the service has received the request of the running call, as far as that is
     /// known before the response.
@@ -115,7 +120,7 @@ impl<C: ServiceCall> Caller<C> {
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             ticks.tick().await;
-            let answer = self.client.call(request.clone()).await;
+            let answer = self.client.call_by(request.clone(), None).await;
             self.report(answer, false).await;
         }
     }
@@ -128,7 +133,7 @@ impl<C: ServiceCall> Caller<C> {
         insist: bool,
     ) -> Next {
         let answer = {
-            let mut call = pin!(self.client.call(request));
+            let mut call = pin!(self.client.call_by(request, None));
             let mut looks = interval(LOOK);
             loop {
                 tokio::select! {
