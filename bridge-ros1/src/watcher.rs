@@ -6,7 +6,6 @@ use std::time::Duration;
 use tcpros::{Graph, Node};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
-use tokio::time::sleep;
 
 /// An event of the watcher.
 #[derive(Debug)]
@@ -44,7 +43,7 @@ impl Watcher {
                 .await
                 .is_ok()
             {
-                sleep(PERIOD).await;
+                idle_ticks::sleep(PERIOD).await;
             }
         });
         Self {

@@ -131,6 +131,11 @@ async fn heard(goal: &mut Sent) -> Option<GoalEvent> {
     .await
 }
 
+/// A time that no goal of a test exceeds.
+fn later() -> std::time::Instant {
+    bridge_node::now().monotonic + Duration::from_secs(3600)
+}
+
 async fn is_accepted(goal: &mut Sent) {
     let event = heard(goal).await;
     assert!(matches!(event, Some(GoalEvent::Accepted(_))), "{event:?}");
@@ -150,7 +155,7 @@ async fn a_goal_waits_for_its_server_to_connect_and_is_followed_to_its_end() {
     let mut server = cell.server();
     let sender = cell.sender(WAITS);
     // No server is connected yet.
-    let mut goal = sender.send_goal(ID, &5i32.to_le_bytes());
+    let mut goal = sender.send_goal(ID, &5i32.to_le_bytes(), later());
     let events = tokio::spawn(async move {
         is_accepted(&mut goal).await;
         let report = Some(GoalEvent::Feedback(Bytes::from_static(&[7, 0, 0, 0])));
@@ -172,7 +177,7 @@ async fn a_goal_is_rejected_with_the_words_of_its_server_and_one_left_undecided_
     let mut cell = Cell::start();
     let mut server = cell.server();
     let sender = cell.sender(WAITS);
-    let mut goal = sender.send_goal(ID, &1i32.to_le_bytes());
+    let mut goal = sender.send_goal(ID, &1i32.to_le_bytes(), later());
     let events = tokio::spawn(async move { heard(&mut goal).await });
     next_goal(&mut server).await.reject("no way").unwrap();
     let rejected = Some(GoalEvent::Rejected("no way".to_owned()));
@@ -195,7 +200,7 @@ async fn goals_are_cancelled_one_by_one_and_all_together() {
     let mut sent = Vec::new();
     let mut taken = Vec::new();
     for id in ids {
-        let mut goal = sender.send_goal(id, &100i32.to_le_bytes());
+        let mut goal = sender.send_goal(id, &100i32.to_le_bytes(), later());
         let accepted = tokio::spawn(async move {
             is_accepted(&mut goal).await;
             goal
@@ -233,7 +238,7 @@ async fn a_goal_without_a_server_was_not_executed_and_a_client_is_shared() {
         ..WAITS
     };
     let sender = cell.sender(waits);
-    let mut goal = sender.send_goal(ID, &[]);
+    let mut goal = sender.send_goal(ID, &[], later());
     let event = heard(&mut goal).await;
     let Some(GoalEvent::Lost { text, ran: Ran::No }) = event else {
         panic!("{event:?}");
@@ -247,6 +252,29 @@ async fn a_goal_without_a_server_was_not_executed_and_a_client_is_shared() {
     assert!(made.is_err(), "it has goals of another type");
     drop((goal, sender, other));
     assert!(cell.graph().action_client("/count", &wrong, waits).is_ok());
+}
+
+#[tokio::test]
+async fn a_goal_is_not_sent_to_a_server_that_connects_after_its_time() {
+    let mut cell = Cell::start();
+    let sender = cell.sender(WAITS);
+    let start_by = bridge_node::now().monotonic + Duration::from_millis(50);
+    let mut goal = sender.send_goal(ID, &5i32.to_le_bytes(), start_by);
+    let lost = tokio::spawn(async move { heard(&mut goal).await });
+    tokio::time::sleep_until(start_by.into()).await;
+    let mut server = cell.server();
+    let event = within("the end", lost).await.unwrap();
+    let Some(GoalEvent::Lost { text, ran: Ran::No }) = event else {
+        panic!("{event:?}");
+    };
+    assert!(text.contains("the time until which it may start"), "{text}");
+    let mut next = sender.send_goal([1; 16], &6i32.to_le_bytes(), later());
+    let followed = tokio::spawn(async move { heard(&mut next).await });
+    let first = next_goal(&mut server).await;
+    assert_eq!(first.goal_id().id, spelled([1; 16]));
+    first.accept("").unwrap();
+    let accepted = within("the answer", followed).await.unwrap();
+    assert!(matches!(accepted, Some(GoalEvent::Accepted(_))));
 }
 
 #[tokio::test]

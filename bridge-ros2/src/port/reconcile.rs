@@ -28,7 +28,7 @@ impl Ros2Port {
     /// queue and drops commands that do not fit.
     pub(super) fn reconcile(&mut self, now: Instant) {
         let domain = self.domain.changes();
-        let is_due = self.schedule.is_look_due(domain, now) || self.descriptions.is_asking(now);
+        let is_due = self.schedule.is_look_due(domain, now);
         self.schedule.reconciled = now;
         let free = self.descriptors.free();
         self.budget = MAX_BATCH.min(free.mapped);
@@ -67,6 +67,10 @@ impl Ros2Port {
         let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
         for topic in topics {
             self.reconcile_sink(topic, now);
+        }
+        if self.descriptions.is_asking(now) {
+            // Replies are taken in a pass.
+            self.schedule.look_next();
         }
     }
 

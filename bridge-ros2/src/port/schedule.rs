@@ -78,12 +78,13 @@ impl Schedule {
 
     /// Returns the time of the next reconciliation.
     pub(super) fn next_reconcile(&self) -> Instant {
-        self.reconciled
-            + match (self.unfinished, self.changed) {
-                (true, _) => BATCH_PAUSE,
-                (false, true) => SETTLE,
-                (false, false) => POLL,
-            }
+        let pause = match (self.unfinished, self.changed) {
+            (true, _) => BATCH_PAUSE,
+            (false, true) => SETTLE,
+            (false, false) if self.looked.is_none() => POLL,
+            (false, false) => return idle_ticks::next(self.reconciled, IDLE_POLL),
+        };
+        self.reconciled + pause
     }
 
     fn next(&self, now: Instant) -> Instant {
@@ -104,7 +105,8 @@ impl Schedule {
     /// Returns whether work is due; otherwise the task is woken when it is.
     pub(super) fn is_due(&mut self, cx: &mut Context<'_>) -> bool {
         // `publish` and discovery move the time forward.
-        if self.changed || self.unfinished || self.is_waiting() {
+        let is_looked = self.looked.is_some();
+        if self.changed || self.unfinished || self.is_waiting() || !is_looked {
             let now = Instant::now();
             if self.next(now) < self.timer.deadline() {
                 self.arm(now);
@@ -114,8 +116,10 @@ impl Schedule {
     }
 }
 
-/// The interval of passes while no change is reported.
+/// The interval of passes while changes are not reported, or wait for a reply.
 const POLL: Duration = Duration::from_millis(200);
+/// The interval of passes while no change is reported.
+const IDLE_POLL: Duration = Duration::from_millis(500);
 /// The interval of passes over all topics in an unchanged domain, for changes that depend on time
 /// only and may be noticed late. Shorter than the time after which a type is of no interest (3 s).
 const LOOK: Duration = Duration::from_secs(2);
@@ -153,6 +157,11 @@ mod tests {
         schedule.note_waiting(topic, true);
         assert_eq!(schedule.waiting(), [topic]);
         assert!(schedule.is_look_due(Some(1), later));
+        // An unchanged domain is polled less often.
+        schedule.reconciled = now;
+        assert!(schedule.next_reconcile() >= now + IDLE_POLL);
+        schedule.look_next();
+        assert_eq!(schedule.next_reconcile(), now + POLL);
         // The published RustDDS provides no change count.
         schedule.note_waiting(topic, false);
         assert!(!schedule.is_waiting());

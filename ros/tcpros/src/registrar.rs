@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use log_limit::Throttle;
 use tokio::task::JoinSet;
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::{Instant, timeout};
 
 use crate::clock;
 use crate::events;
@@ -61,7 +61,7 @@ pub(crate) async fn run(node: Arc<Inner>) {
         }
         tokio::select! {
             () = node.changed.notified() => {}
-            () = sleep(wait) => {}
+            () = idle_ticks::sleep(wait) => {}
         }
     }
 }

@@ -137,6 +137,7 @@ impl ProgramSet {
 }
 
 fn serve(programs: ProgramSet) -> Result<(), Failure> {
+    idle_ticks::start();
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

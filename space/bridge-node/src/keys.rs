@@ -12,7 +12,6 @@ use std::time::{Duration, SystemTime};
 use bridge_core::{KeyDelivery, Router};
 use mappings::{KeySource, Mapping, SecurityGroup};
 use tokio::sync::{mpsc, watch};
-use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
 
 pub use self::fetch::{Fetched, Fetching, KeyRequest, KeyService};
@@ -186,12 +185,11 @@ async fn watch_file(
         }
         None => return,
     };
-    let mut looks = interval(LOOK);
-    looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut pause = Duration::ZERO;
     let mut before: Option<Option<Seen>> = None;
     loop {
         tokio::select! {
-            _ = looks.tick() => {}
+            () = idle_ticks::sleep(pause) => pause = LOOK,
             changed = wants.changed() => if changed.is_err() {
                 return;
             },

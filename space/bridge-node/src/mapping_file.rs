@@ -20,7 +20,6 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
-use tokio::time::sleep;
 use tracing::{error, info, warn};
 use type_files::{Environment, TypeFiles, TypePaths};
 
@@ -387,7 +386,7 @@ impl MappingFile {
         loop {
             let asked = tokio::select! {
                 Some(()) = hangup.recv() => true,
-                () = sleep(pause), if self.file.is_some() => false,
+                () = idle_ticks::sleep(pause), if self.file.is_some() => false,
             };
             pause = LOOK;
             let Some(file) = self.file.clone() else {

@@ -250,6 +250,7 @@ fn check_redundancy<P: Program>(
 fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
     // A single thread: samples pass from the socket to ROS and back without a change of threads,
     // and the state needs no lock.
+    idle_ticks::start();
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

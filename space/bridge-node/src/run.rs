@@ -19,7 +19,7 @@ use bridge_core::{Handover, Heard, Notice, Output, Owned, Reason, Router};
 use bytes::Bytes;
 use mappings::{Mapping, PubSub, SpaceId, TopicId};
 use tokio::sync::watch;
-use tokio::time::{Instant as TokioInstant, MissedTickBehavior, Sleep, interval};
+use tokio::time::{Instant as TokioInstant, Sleep};
 use tracing::{debug, info, warn};
 use transport::{BUFFER, Carrier, Finding, Held, Outgoing, Received, SendError};
 use uadp::Timestamp;
@@ -177,8 +177,7 @@ impl<P: Port> Shell<P> {
     ) -> Result<(), Failure> {
         let mut stop = pin!(stop);
         let mut timer = pin!(tokio::time::sleep(FAR));
-        let mut looks = interval(transport::LOOK);
-        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut looks = pin!(tokio::time::sleep(Duration::ZERO));
         let mut buffer = vec![0; BUFFER];
         let mut more = false;
         loop {
@@ -201,7 +200,8 @@ impl<P: Port> Shell<P> {
                     self.read_waiting(&mut buffer);
                     self.router.handle_timeout(now());
                 }
-                _ = looks.tick() => {
+                () = looks.as_mut() => {
+                    looks.as_mut().reset(idle_ticks::next(TokioInstant::now(), transport::LOOK));
                     self.follow_group();
                     self.look_at_held()?;
                     self.port.counted(&self.router);
