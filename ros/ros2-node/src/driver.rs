@@ -139,7 +139,11 @@ impl Driver {
         loop {
             let now = Instant::now();
             let timeout = self.event_loop.timeout();
-            let due = now + timeout;
+            let due = if timeout < COARSE {
+                now + timeout
+            } else {
+                idle_ticks::next(now, timeout)
+            };
             let rings = timeout < SHORT && self.alarm.ring_at(due, now).is_ok();
             // Only an earlier deadline needs the timer wheel; a later deadline is detected when the
             // timer fires. An elapsed timer is ready at each poll, also while the alarm is set.
@@ -242,6 +246,9 @@ impl Alarm {
     }
 }
 
+/// Deadlines that are further away are met up to a tick late. They are those of heartbeats, leases
+/// and clean-ups, which last for seconds.
+const COARSE: Duration = Duration::from_millis(500);
 /// Deadlines that are nearer are set by the alarm.
 const SHORT: Duration = Duration::from_millis(2);
 

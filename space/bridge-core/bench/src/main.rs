@@ -16,6 +16,9 @@ use uadp::Timestamp;
 const ROUNDS: u32 = 15;
 const MESSAGES: u32 = 20_000;
 const MANY: u16 = 10_000;
+/// The time between two messages of a topic, for any number of topics. No value is old enough to be
+/// repeated.
+const ROUND: Duration = Duration::from_millis(1);
 
 /// A measured case, with a name for tables and the command line.
 struct Case {
@@ -90,6 +93,8 @@ struct Bench {
     router: Router,
     now: Now,
     topics: Vec<TopicId>,
+    /// The time between two messages.
+    step: Duration,
     /// A datagram for each topic of another space; empty if the topics are of the own space.
     datagrams: Vec<Vec<u8>>,
     next: usize,
@@ -109,6 +114,7 @@ impl Bench {
             router: router(1),
             now,
             topics: ids().collect(),
+            step: ROUND / u32::from(count),
             datagrams: Vec::new(),
             next: 0,
             passed: 0,
@@ -135,7 +141,7 @@ impl Bench {
     /// Passes messages, one after the other, of all topics in turn.
     fn pass(&mut self, messages: u32) {
         for _ in 0..messages {
-            self.now.monotonic += Duration::from_micros(10);
+            self.now.monotonic += self.step;
             let at = self.next;
             self.next = (at + 1) % self.topics.len();
             match self.datagrams.get_mut(at) {
