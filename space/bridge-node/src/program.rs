@@ -35,7 +35,7 @@ use crate::observer::Observer;
 use crate::port::Port;
 use crate::redundancy;
 use crate::restart;
-use crate::run::{Fixed, Outbox, Shell};
+use crate::run::{Fixed, Outbox, Shell, Turn};
 use crate::service;
 use crate::service_manager;
 use crate::signals;
@@ -401,6 +401,10 @@ async fn prepare<P: Program>(
         taken: BTreeMap::new(),
         awaited: PeerWatch::new(now().monotonic),
         busy: BusyPoll::new(Duration::from_micros(arguments.flags.busy_poll.into())),
+        turn: match hub {
+            Some(_) => Turn::Shared,
+            None => Turn::Whole,
+        },
         dry_run: arguments.flags.dry_run,
         observer,
         _told: told,

@@ -75,10 +75,31 @@ pub(crate) struct Shell<P> {
     /// The peers that are missing.
     pub(crate) awaited: PeerWatch,
     pub(crate) busy: BusyPoll,
+    /// The number of datagrams or events that are handled in a row.
+    pub(crate) turn: Turn,
     pub(crate) dry_run: bool,
     pub(crate) observer: Option<Arc<dyn Observer>>,
     /// Announces the space outside the group until it is dropped.
     pub(crate) _told: Option<Box<dyn Send + Sync>>,
+}
+
+/// The number of datagrams, or of events of the port, that a run loop handles in a row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Turn {
+    /// The program has a thread of its own.
+    Whole,
+    /// Other programs share the thread. The first values of a burst do not wait in one program
+    /// until the other program has handled all of them.
+    Shared,
+}
+
+impl Turn {
+    const fn length(self) -> usize {
+        match self {
+            Self::Whole => 32,
+            Self::Shared => 8,
+        }
+    }
 }
 
 /// Whether the program runs or is about to end.
@@ -218,6 +239,10 @@ impl<P: Port> Shell<P> {
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
             more |= self.drain();
+            if more && self.turn == Turn::Shared {
+                // The other program of the thread passes on the values of this turn first.
+                tokio::task::yield_now().await;
+            }
             if self.taps.is_on() || self.router.is_tapped() {
                 self.follow_taps();
             }
@@ -229,7 +254,7 @@ impl<P: Port> Shell<P> {
     /// datagrams. Returns whether more datagrams may be queued.
     fn heard_all(&mut self, first: io::Result<Received>, buffer: &mut Vec<u8>) -> bool {
         let mut heard = first;
-        for _ in 0..TAKEN_AT_ONCE {
+        for _ in 0..self.turn.length() {
             self.heard(heard, buffer);
             if self.drain() {
                 return true;
@@ -248,7 +273,7 @@ impl<P: Port> Shell<P> {
     /// samples may share a datagram, all queued samples are collected before a datagram is sent.
     async fn port_events(&mut self, first: PortEvent) -> Result<bool, Failure> {
         let mut event = first;
-        for _ in 0..TAKEN_AT_ONCE {
+        for _ in 0..self.turn.length() {
             if self.port_event_and_drain(event)? {
                 return Ok(true);
             }
@@ -712,8 +737,6 @@ fn tell(notice: &Notice, name: Option<&str>) {
 /// The maximal number of outputs carried out before the other branches are polled. If sending is
 /// slower than the Router produces parts of large messages, there is always a further output.
 const DRAINED_AT_ONCE: usize = 64;
-/// The maximal number of datagrams, or of events of the port, handled in a row.
-const TAKEN_AT_ONCE: usize = 32;
 /// The maximal number of probes of the observer in a second.
 const MOST_PROBES: usize = 8;
 /// How long the end of the program waits for pending cancellations.
