@@ -351,7 +351,7 @@ fn owned(environment: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
         .collect()
 }
 
-const MAPPING: &str = include_str!("../../../mappings/assembly-line.yaml");
+const MAPPING: &str = include_str!("../../mappings/assembly-line.yaml");
 /// Time limit for the programs to connect to each other.
 const BEGIN_WITHIN: Duration = Duration::from_secs(60);
 /// Time for processes that do not speed up with the scenario.
