@@ -35,6 +35,29 @@ pub enum BuiltinType {
 }
 
 impl BuiltinType {
+    /// Returns whether values of the type are integers.
+    #[must_use]
+    pub const fn is_integer(self) -> bool {
+        matches!(
+            self,
+            Self::SByte
+                | Self::Byte
+                | Self::Int16
+                | Self::UInt16
+                | Self::Int32
+                | Self::UInt32
+                | Self::Int64
+                | Self::UInt64
+        )
+    }
+
+    /// Returns whether values of the type are numbers, which can be scaled and converted to other
+    /// numbers.
+    #[must_use]
+    pub const fn is_number(self) -> bool {
+        self.is_integer() || matches!(self, Self::Float | Self::Double)
+    }
+
     /// All builtin types, in the order of the ids.
     pub const ALL: [Self; 25] = [
         Self::Boolean,

@@ -221,8 +221,7 @@ fn levels(
     subject: &Subject<'_>,
     findings: &mut Findings,
 ) -> Option<AlarmLimits> {
-    let is_number =
-        matches!(subject.value_type, Some((builtin, false)) if messages::is_number(builtin));
+    let is_number = matches!(subject.value_type, Some((builtin, false)) if builtin.is_number());
     if !is_number {
         let message = format!("limits require a number, but this is {}", told(subject));
         findings
@@ -301,7 +300,7 @@ fn value(
         Some((BuiltinType::Boolean, false)) => text.parse().ok().map(AlarmValue::Boolean),
         Some((BuiltinType::String, false)) => Some(AlarmValue::Text(text.to_owned())),
         Some((BuiltinType::Float | BuiltinType::Double, false)) => None,
-        Some((builtin, false)) if messages::is_number(builtin) => {
+        Some((builtin, false)) if builtin.is_number() => {
             let number = text.parse().ok().or_else(named);
             number.map(AlarmValue::Integer)
         }

@@ -255,7 +255,7 @@ fn are_comparable(written: &Variable, by: &Variable) -> bool {
         && fields
             .map(|(one, other)| (types::value_type(one), types::value_type(other)))
             .all(|(one, other)| {
-                let numbers = messages::is_number(one.0) && messages::is_number(other.0);
+                let numbers = one.0.is_number() && other.0.is_number();
                 one == other || (numbers && one.1 == other.1)
             })
 }
@@ -265,7 +265,7 @@ fn is_value(text: &str, value_type: Option<types::ValueType>) -> bool {
     match value_type {
         Some((BuiltinType::Boolean, false)) => matches!(text, "true" | "false"),
         Some((BuiltinType::String, false)) => true,
-        Some((builtin, false)) if messages::is_number(builtin) => text.parse::<f64>().is_ok(),
+        Some((builtin, false)) if builtin.is_number() => text.parse::<f64>().is_ok(),
         Some(_) | None => false,
     }
 }

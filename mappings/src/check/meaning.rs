@@ -54,8 +54,7 @@ pub(super) fn check(
     let mut texts = BTreeMap::new();
     if let Some((pairs, place)) = given(&entry.r#enum) {
         let whole = value.0.is_none_or(|(builtin, _)| {
-            messages::is_number(builtin)
-                && !matches!(builtin, BuiltinType::Float | BuiltinType::Double)
+            builtin.is_number() && !matches!(builtin, BuiltinType::Float | BuiltinType::Double)
         });
         if value.1 || !whole {
             let told = told(value);
@@ -133,9 +132,7 @@ fn numbers(
     (key, code, place): (&str, Code, Place),
     findings: &mut Findings,
 ) -> Option<()> {
-    let number = value
-        .0
-        .is_none_or(|(builtin, _)| messages::is_number(builtin));
+    let number = value.0.is_none_or(|(builtin, _)| builtin.is_number());
     if number && !value.1 {
         return Some(());
     }

@@ -112,7 +112,7 @@ fn may_come(entry: &VariableEntry, subject: &Subject<'_>, findings: &mut Finding
     if let Some((_, at)) = deadband.and_then(|from| given(&from.deadband))
         && subject
             .value_type
-            .is_some_and(|(builtin, array)| array || !messages::is_number(builtin))
+            .is_some_and(|(builtin, array)| array || !builtin.is_number())
     {
         let message = "a deadband of a server requires a single number".to_owned();
         fault(at, message, "remove it: the server reports every change");

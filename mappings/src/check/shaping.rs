@@ -2,7 +2,7 @@
 //! `out_of_range`.
 
 use messages::{
-    Conversion, Leaf, MessageType, Part, Plan, PlanError, Selection, Wire, is_lossless, is_number,
+    Conversion, Leaf, MessageType, Part, Plan, PlanError, Selection, Wire, is_lossless,
 };
 use uadp::BuiltinType;
 
@@ -255,7 +255,7 @@ impl Shaping {
         let mut conversion = self.conversion;
         let declared = way.declared.map(|(builtin, _)| builtin);
         let to = declared.filter(|to| {
-            is_number(*to) && element.is_none_or(|from| is_number(from) && from != *to)
+            to.is_number() && element.is_none_or(|from| from.is_number() && from != *to)
         });
         if let Some(to) = to {
             conversion = conversion.to(to);
@@ -270,8 +270,8 @@ impl Shaping {
             (outside, inside)
         };
         let whole = !matches!(into, BuiltinType::Float | BuiltinType::Double);
-        let lossy = (is_number(from) && !is_lossless(from, into))
-            || (self.scaled && is_number(into) && whole);
+        let lossy = (from.is_number() && !is_lossless(from, into))
+            || (self.scaled && into.is_number() && whole);
         if lossy && !self.said {
             let message = match self.scaled && from == into {
                 true => format!("scaled values do not fit {} without rounding", into.name()),

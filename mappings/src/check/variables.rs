@@ -467,13 +467,13 @@ fn publish(
                 format!("a deadband of {width}"),
                 "give a number above 0, in the unit of the value",
             ))
-        } else if value_type.is_some_and(|(builtin, _)| !messages::is_number(builtin)) {
+        } else if value_type.is_some_and(|(builtin, _)| !builtin.is_number()) {
             let told = value_type.map(types::print).unwrap_or_default();
             Some((
                 format!("a deadband requires numbers, but this is {told}"),
                 "use `publish: on_change`, which works with all values",
             ))
-        } else if fields.len() > 1 && !fields.iter().any(|leaf| messages::is_number(leaf.builtin)) {
+        } else if fields.len() > 1 && !fields.iter().any(|leaf| leaf.builtin.is_number()) {
             Some((
                 "a deadband requires numbers, but no field is a number".to_owned(),
                 "use `publish: on_change`, which works with all values",

@@ -355,21 +355,7 @@ fn scalar_weight(value: &Scalar<'_>) -> usize {
 
 /// Returns true if the Variant of the server stores such a value in a separate allocation.
 const fn is_boxed(builtin: BuiltinType) -> bool {
-    !matches!(
-        builtin,
-        BuiltinType::Boolean
-            | BuiltinType::SByte
-            | BuiltinType::Byte
-            | BuiltinType::Int16
-            | BuiltinType::UInt16
-            | BuiltinType::Int32
-            | BuiltinType::UInt32
-            | BuiltinType::Int64
-            | BuiltinType::UInt64
-            | BuiltinType::Float
-            | BuiltinType::Double
-            | BuiltinType::StatusCode
-    )
+    !builtin.is_number() && !matches!(builtin, BuiltinType::Boolean | BuiltinType::StatusCode)
 }
 
 const VARIANT: usize = size_of::<Variant>();

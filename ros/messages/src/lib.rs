@@ -87,9 +87,7 @@ pub use library::{
 };
 pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
-pub use plan::{
-    Conversion, Literal, Part, Plan, Selected, Selection, Wire, is_lossless, is_number,
-};
+pub use plan::{Conversion, Literal, Part, Plan, Selected, Selection, Wire, constant, is_lossless};
 pub use registry::{PeerDefinitions, Registry};
 pub use service::{ActionMessages, ActionType, ServiceType};
 pub use structure::{MemberKind, Structure, StructureMember};

@@ -14,9 +14,9 @@ use std::sync::Arc;
 
 use uadp::{BuiltinType, Scalar};
 
-pub use conversion::{Conversion, is_lossless, is_number};
-pub use literal::Literal;
+pub use conversion::{Conversion, is_lossless};
 use literal::{Given, Typed};
+pub use literal::{Literal, constant};
 pub use several::Selected;
 use several::Several;
 pub use shaped::Part;

@@ -2,8 +2,8 @@
 
 use std::fmt::Display;
 
-use messages::{Literal, Rank};
-use uadp::{BuiltinType, DateTime, FieldEncoder, Scalar};
+use messages::{Literal, Rank, constant};
+use uadp::{BuiltinType, FieldEncoder, Scalar};
 
 use crate::block;
 use crate::counters::Cause;
@@ -44,7 +44,7 @@ pub(crate) fn block(
         }
     };
     let values = texts.iter().map(|text| {
-        scalar(builtin, text).ok_or_else(|| format!("`{text}` is not a valid value of {field}"))
+        constant(builtin, text).ok_or_else(|| format!("`{text}` is not a valid value of {field}"))
     });
     let values: Vec<Scalar<'_>> = values.collect::<Result<_, _>>()?;
     encode(|frame| match rank {
@@ -61,38 +61,6 @@ fn encode(
 ) -> Result<Vec<u8>, String> {
     let written = block::block(|frame| write(frame).map_err(block::too_big));
     written.map_err(|(_, why): (Cause, String)| why)
-}
-
-fn scalar(builtin: BuiltinType, text: &str) -> Option<Scalar<'_>> {
-    Some(match builtin {
-        BuiltinType::Boolean => Scalar::Boolean(text.parse().ok()?),
-        BuiltinType::SByte => Scalar::SByte(text.parse().ok()?),
-        BuiltinType::Byte => Scalar::Byte(text.parse().ok()?),
-        BuiltinType::Int16 => Scalar::Int16(text.parse().ok()?),
-        BuiltinType::UInt16 => Scalar::UInt16(text.parse().ok()?),
-        BuiltinType::Int32 => Scalar::Int32(text.parse().ok()?),
-        BuiltinType::UInt32 => Scalar::UInt32(text.parse().ok()?),
-        BuiltinType::Int64 => Scalar::Int64(text.parse().ok()?),
-        BuiltinType::UInt64 => Scalar::UInt64(text.parse().ok()?),
-        BuiltinType::Float => Scalar::Float(text.parse().ok()?),
-        BuiltinType::Double => Scalar::Double(text.parse().ok()?),
-        BuiltinType::String => Scalar::String(Some(text)),
-        // The only constant time is 0, the null DateTime.
-        BuiltinType::DateTime if text == "0" => Scalar::DateTime(DateTime::default()),
-        BuiltinType::DateTime
-        | BuiltinType::Guid
-        | BuiltinType::ByteString
-        | BuiltinType::XmlElement
-        | BuiltinType::NodeId
-        | BuiltinType::ExpandedNodeId
-        | BuiltinType::StatusCode
-        | BuiltinType::QualifiedName
-        | BuiltinType::LocalizedText
-        | BuiltinType::ExtensionObject
-        | BuiltinType::DataValue
-        | BuiltinType::Variant
-        | BuiltinType::DiagnosticInfo => return None,
-    })
 }
 
 #[cfg(test)]

@@ -207,7 +207,7 @@ fn has_target(message: &MessageType, target: &str) -> bool {
 
 /// Returns `true` if the constant is a value of a field in a request.
 fn is_value(leaf: &Leaf, literal: &Literal) -> bool {
-    let fits = |text: &String| is_scalar(leaf.builtin, text);
+    let fits = |text: &String| messages::constant(leaf.builtin, text).is_some();
     match (literal, leaf.rank) {
         (Literal::One(text), Rank::Scalar) => fits(text),
         (Literal::List(texts), Rank::Scalar) => {
@@ -219,36 +219,5 @@ fn is_value(leaf: &Leaf, literal: &Literal) -> bool {
                 && texts.iter().all(fits)
         }
         (Literal::One(_), Rank::Array { .. }) => false,
-    }
-}
-
-fn is_scalar(builtin: BuiltinType, text: &str) -> bool {
-    match builtin {
-        BuiltinType::Boolean => text.parse::<bool>().is_ok(),
-        BuiltinType::SByte => text.parse::<i8>().is_ok(),
-        BuiltinType::Byte => text.parse::<u8>().is_ok(),
-        BuiltinType::Int16 => text.parse::<i16>().is_ok(),
-        BuiltinType::UInt16 => text.parse::<u16>().is_ok(),
-        BuiltinType::Int32 => text.parse::<i32>().is_ok(),
-        BuiltinType::UInt32 => text.parse::<u32>().is_ok(),
-        BuiltinType::Int64 => text.parse::<i64>().is_ok(),
-        BuiltinType::UInt64 => text.parse::<u64>().is_ok(),
-        BuiltinType::Float => text.parse::<f32>().is_ok(),
-        BuiltinType::Double => text.parse::<f64>().is_ok(),
-        BuiltinType::String => true,
-        // The zero time is the only constant of a DateTime.
-        BuiltinType::DateTime => text == "0",
-        BuiltinType::Guid
-        | BuiltinType::ByteString
-        | BuiltinType::XmlElement
-        | BuiltinType::NodeId
-        | BuiltinType::ExpandedNodeId
-        | BuiltinType::StatusCode
-        | BuiltinType::QualifiedName
-        | BuiltinType::LocalizedText
-        | BuiltinType::ExtensionObject
-        | BuiltinType::DataValue
-        | BuiltinType::Variant
-        | BuiltinType::DiagnosticInfo => false,
     }
 }

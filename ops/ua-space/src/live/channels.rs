@@ -12,7 +12,7 @@ use messages::{Dialect, Leaf, MessageType, Plan, Rank, Selection, TypeName, Wire
 use serde_json::{Map, Value, json};
 use uadp::{BuiltinType, DataSetMessage, MessageKind, Scalar, Variant};
 
-use super::described::{Described, Field, What, is_integer};
+use super::described::{Described, Field, What};
 use super::plain;
 use super::robot::{self, Model};
 
@@ -411,7 +411,7 @@ fn schema_of(field: &Field) -> Value {
 const fn kind(builtin: BuiltinType) -> &'static str {
     match builtin {
         BuiltinType::Boolean => "boolean",
-        integer if is_integer(integer) => "integer",
+        integer if integer.is_integer() => "integer",
         BuiltinType::Float | BuiltinType::Double => "number",
         BuiltinType::ExtensionObject => "object",
         _ => "string",

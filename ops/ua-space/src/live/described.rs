@@ -286,21 +286,6 @@ impl Field {
     }
 }
 
-/// Returns whether values of a type are integers.
-pub(super) const fn is_integer(builtin: BuiltinType) -> bool {
-    matches!(
-        builtin,
-        BuiltinType::SByte
-            | BuiltinType::Byte
-            | BuiltinType::Int16
-            | BuiltinType::UInt16
-            | BuiltinType::Int32
-            | BuiltinType::UInt32
-            | BuiltinType::Int64
-            | BuiltinType::UInt64
-    )
-}
-
 /// Returns a list of fields, as `TargetPosition: Double[6], [MaxVelocity: Double]`, with optional
 /// fields in brackets.
 pub(crate) fn list(fields: &[Field]) -> String {

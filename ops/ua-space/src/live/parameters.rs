@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 use uadp::BuiltinType;
 
-use super::described::{Field, is_integer, list};
+use super::described::{Field, list};
 use crate::values::FieldValue;
 use crate::values::variant_bytes;
 
@@ -131,7 +131,7 @@ fn scalar(builtin: BuiltinType, text: &str) -> Result<Value, String> {
             .parse::<bool>()
             .map(Value::from)
             .map_err(|_| expected()),
-        integer if is_integer(integer) => match text.parse::<i128>() {
+        integer if integer.is_integer() => match text.parse::<i128>() {
             Ok(_) => Ok(json!(text)),
             Err(_) => Err(expected()),
         },

@@ -79,10 +79,10 @@ impl Conversion {
         if self.invert && (field, to) != (BuiltinType::Boolean, BuiltinType::Boolean) {
             return Err("is not a Boolean, and `invert` needs a Boolean");
         }
-        if self.linear.is_some() && !is_number(field) {
+        if self.linear.is_some() && !field.is_number() {
             return Err("is not a number, and `scale` and `offset` need a number");
         }
-        if to != field && !(is_number(field) && is_number(to)) {
+        if to != field && !(field.is_number() && to.is_number()) {
             return Err("cannot become that type: only numbers become other numbers");
         }
         Ok(to)
@@ -170,12 +170,6 @@ pub const fn is_lossless(from: BuiltinType, to: BuiltinType) -> bool {
         T::Double => matches!(to, T::Double),
         _ => false,
     }
-}
-
-/// Returns whether values of the type can be scaled and converted to other numbers.
-#[must_use]
-pub const fn is_number(builtin: BuiltinType) -> bool {
-    is_lossless(builtin, builtin)
 }
 
 #[expect(

@@ -1,6 +1,6 @@
 //! Constants of a template: conversion of texts to values of their fields.
 
-use uadp::{BuiltinType, Scalar};
+use uadp::{BuiltinType, DateTime, Scalar};
 
 use super::What;
 use crate::definition::{Clock, Constant, Number, Primitive};
@@ -18,6 +18,40 @@ pub enum Literal {
     One(String),
     /// The elements of a field that is an array, including bytes.
     List(Vec<String>),
+}
+
+/// Returns the value of a constant as written in a mapping; `None` if it does not fit the type.
+#[must_use]
+pub fn constant(builtin: BuiltinType, text: &str) -> Option<Scalar<'_>> {
+    Some(match builtin {
+        BuiltinType::Boolean => Scalar::Boolean(text.parse().ok()?),
+        BuiltinType::SByte => Scalar::SByte(text.parse().ok()?),
+        BuiltinType::Byte => Scalar::Byte(text.parse().ok()?),
+        BuiltinType::Int16 => Scalar::Int16(text.parse().ok()?),
+        BuiltinType::UInt16 => Scalar::UInt16(text.parse().ok()?),
+        BuiltinType::Int32 => Scalar::Int32(text.parse().ok()?),
+        BuiltinType::UInt32 => Scalar::UInt32(text.parse().ok()?),
+        BuiltinType::Int64 => Scalar::Int64(text.parse().ok()?),
+        BuiltinType::UInt64 => Scalar::UInt64(text.parse().ok()?),
+        BuiltinType::Float => Scalar::Float(text.parse().ok()?),
+        BuiltinType::Double => Scalar::Double(text.parse().ok()?),
+        BuiltinType::String => Scalar::String(Some(text)),
+        // The only constant time is 0, the null DateTime.
+        BuiltinType::DateTime if text == "0" => Scalar::DateTime(DateTime::default()),
+        BuiltinType::DateTime
+        | BuiltinType::Guid
+        | BuiltinType::ByteString
+        | BuiltinType::XmlElement
+        | BuiltinType::NodeId
+        | BuiltinType::ExpandedNodeId
+        | BuiltinType::StatusCode
+        | BuiltinType::QualifiedName
+        | BuiltinType::LocalizedText
+        | BuiltinType::ExtensionObject
+        | BuiltinType::DataValue
+        | BuiltinType::Variant
+        | BuiltinType::DiagnosticInfo => return None,
+    })
 }
 
 /// A constant and its field.

@@ -78,32 +78,18 @@ pub(in crate::live) fn message(
 /// Returns the default value of a field; `None` for types that ROS messages do not have.
 fn nothing(field: &Field) -> Option<String> {
     let builtin = field.builtin?;
-    let one = match builtin {
-        BuiltinType::Boolean => "false",
-        BuiltinType::SByte
-        | BuiltinType::Byte
-        | BuiltinType::Int16
-        | BuiltinType::UInt16
-        | BuiltinType::Int32
-        | BuiltinType::UInt32
-        | BuiltinType::Int64
-        | BuiltinType::UInt64
-        | BuiltinType::Float
-        | BuiltinType::Double => "0",
-        BuiltinType::String | BuiltinType::ByteString => "",
-        BuiltinType::DateTime => "1970-01-01T00:00:00Z",
-        BuiltinType::ExtensionObject if field.is_array() => "",
-        BuiltinType::ExtensionObject
-        | BuiltinType::Guid
-        | BuiltinType::XmlElement
-        | BuiltinType::NodeId
-        | BuiltinType::ExpandedNodeId
-        | BuiltinType::StatusCode
-        | BuiltinType::QualifiedName
-        | BuiltinType::LocalizedText
-        | BuiltinType::DataValue
-        | BuiltinType::Variant
-        | BuiltinType::DiagnosticInfo => return None,
+    let one = if builtin == BuiltinType::Boolean {
+        "false"
+    } else if builtin.is_number() {
+        "0"
+    } else if matches!(builtin, BuiltinType::String | BuiltinType::ByteString)
+        || builtin == BuiltinType::ExtensionObject && field.is_array()
+    {
+        ""
+    } else if builtin == BuiltinType::DateTime {
+        "1970-01-01T00:00:00Z"
+    } else {
+        return None;
     };
     if !field.is_array() {
         return Some(one.to_owned());

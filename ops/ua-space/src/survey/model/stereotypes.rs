@@ -549,33 +549,15 @@ enum Class {
 }
 
 impl Class {
-    const fn of(builtin: BuiltinType) -> Self {
-        match builtin {
-            BuiltinType::Boolean => Self::Boolean,
-            BuiltinType::SByte
-            | BuiltinType::Byte
-            | BuiltinType::Int16
-            | BuiltinType::UInt16
-            | BuiltinType::Int32
-            | BuiltinType::UInt32
-            | BuiltinType::Int64
-            | BuiltinType::UInt64
-            | BuiltinType::Float
-            | BuiltinType::Double => Self::Number,
-            BuiltinType::String => Self::Text,
-            BuiltinType::DateTime
-            | BuiltinType::Guid
-            | BuiltinType::ByteString
-            | BuiltinType::XmlElement
-            | BuiltinType::NodeId
-            | BuiltinType::ExpandedNodeId
-            | BuiltinType::StatusCode
-            | BuiltinType::QualifiedName
-            | BuiltinType::LocalizedText
-            | BuiltinType::ExtensionObject
-            | BuiltinType::DataValue
-            | BuiltinType::Variant
-            | BuiltinType::DiagnosticInfo => Self::Other,
+    fn of(builtin: BuiltinType) -> Self {
+        if builtin.is_number() {
+            Self::Number
+        } else if builtin == BuiltinType::Boolean {
+            Self::Boolean
+        } else if builtin == BuiltinType::String {
+            Self::Text
+        } else {
+            Self::Other
         }
     }
 
