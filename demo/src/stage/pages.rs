@@ -3,11 +3,9 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-use http_body_util::{BodyExt as _, Empty, Limited};
-use hyper::Request;
-use hyper::body::Bytes;
-use hyper::header::HOST;
-use hyper_util::rt::TokioIo;
+use bytes::Bytes;
+use http_client::header::HOST;
+use http_client::{Connection, HttpError, Request};
 use serde::de::DeserializeOwned;
 use thiserror::Error;
 use tokio::net::TcpStream;
@@ -25,31 +23,18 @@ async fn request<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
     let stream = TcpStream::connect(address)
         .await
         .map_err(PageError::Connect)?;
-    let (mut sender, connection) =
-        hyper::client::conn::http1::handshake(TokioIo::new(stream)).await?;
     let request = Request::get("/status")
         .header(HOST, address.to_string())
-        .body(Empty::<Bytes>::new())
+        .body(Bytes::new())
         .map_err(|error| PageError::Answer(error.to_string()))?;
-    let answer = async {
-        let response = sender.send_request(request).await?;
-        if !response.status().is_success() {
-            return Err(PageError::Answer(response.status().to_string()));
-        }
-        let body = Limited::new(response.into_body(), MAX_BODY).collect().await;
-        let body = body
-            .map_err(|error| PageError::Answer(error.to_string()))?
-            .to_bytes();
-        serde_json::from_slice(&body).map_err(|error| PageError::Answer(error.to_string()))
-    };
-    tokio::pin!(connection, answer);
-    tokio::select! {
-        biased;
-        answer = &mut answer => answer,
-        // The connection ends when the last byte is read, possibly before the response is
-        // processed.
-        ended = &mut connection => { ended?; answer.await }
+    let response = Connection::open(stream)
+        .await?
+        .send(request, MAX_BODY)
+        .await?;
+    if !response.status().is_success() {
+        return Err(PageError::Answer(response.status().to_string()));
     }
+    serde_json::from_slice(response.body()).map_err(|error| PageError::Answer(error.to_string()))
 }
 
 /// The reason why a page is not available.
@@ -58,7 +43,7 @@ pub(crate) enum PageError {
     #[error("nobody listens there: {0}")]
     Connect(#[source] std::io::Error),
     #[error("HTTP failed: {0}")]
-    Http(#[from] hyper::Error),
+    Http(#[from] HttpError),
     #[error("the answer was not understood: {0}")]
     Answer(String),
     #[error("no answer within {LIMIT:?}")]

@@ -5,10 +5,8 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_body_util::{BodyExt as _, Empty, Limited};
-use hyper::Request;
-use hyper::header::HOST;
-use hyper_util::rt::TokioIo;
+use http_client::header::HOST;
+use http_client::{Connection, Request};
 use serde_json::Value;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
@@ -68,31 +66,16 @@ impl StatusUrl {
         let stream = TcpStream::connect(&self.authority)
             .await
             .map_err(|error| format!("no connection: {error}"))?;
-        let handshake = hyper::client::conn::http1::handshake(TokioIo::new(stream)).await;
-        let (mut sender, connection) = handshake.map_err(text)?;
         let request = Request::get("/status")
             .header(HOST, &self.authority)
-            .body(Empty::<Bytes>::new())
+            .body(Bytes::new())
             .map_err(text)?;
-        let answer = async {
-            let response = sender.send_request(request).await.map_err(text)?;
-            if !response.status().is_success() {
-                return Err(format!("the response is {}", response.status()));
-            }
-            let body = Limited::new(response.into_body(), MOST_BYTES)
-                .collect()
-                .await;
-            let body = body.map_err(text)?.to_bytes();
-            serde_json::from_slice(&body).map_err(|error| format!("no status: {error}"))
-        };
-        tokio::pin!(connection, answer);
-        tokio::select! {
-            biased;
-            answer = &mut answer => answer,
-            // The connection ends when the last byte is read, possibly before the response is
-            // processed.
-            ended = &mut connection => { ended.map_err(text)?; answer.await }
+        let connection = Connection::open(stream).await.map_err(text)?;
+        let response = connection.send(request, MOST_BYTES).await.map_err(text)?;
+        if !response.status().is_success() {
+            return Err(format!("the response is {}", response.status()));
         }
+        serde_json::from_slice(response.body()).map_err(|error| format!("no status: {error}"))
     }
 }
 

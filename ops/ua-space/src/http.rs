@@ -4,11 +4,9 @@ use std::time::Duration;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use http_body_util::{BodyExt as _, Full, Limited};
-use hyper::body::Bytes;
-use hyper::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST};
-use hyper::{Method, Request};
-use hyper_util::rt::TokioIo;
+use bytes::Bytes;
+use http_client::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST};
+use http_client::{Connection, HttpError, Method, Request};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
@@ -149,10 +147,6 @@ impl Server {
             .await
             .map_err(|error| format!("nobody listens there ({error})"))?;
         let is_protobuf = content_type == PROTOBUF;
-        let text = |error: hyper::Error| error.to_string();
-        let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
-            .await
-            .map_err(text)?;
         let mut request = Request::builder()
             .method(method)
             .uri(format!("{}{path}", self.prefix_path()))
@@ -164,42 +158,25 @@ impl Server {
         if let Some(user) = user {
             request = request.header(AUTHORIZATION, user);
         }
-        let request = request
-            .body(Full::new(body))
-            .map_err(|error| error.to_string())?;
-        let answer = async {
-            let response = sender.send_request(request).await.map_err(text)?;
-            let status = response.status().as_u16();
-            let content_type = response.headers().get(CONTENT_TYPE);
-            let content_type = content_type.and_then(|value| value.to_str().ok());
-            let content_type = content_type.unwrap_or_default().to_owned();
-            let body = Limited::new(response.into_body(), MOST_BYTES)
-                .collect()
-                .await;
-            let body = body.map_err(|error| error.to_string())?.to_bytes();
-            let body = match String::from_utf8(body.into()) {
-                Ok(body) => body,
-                // A collector of OTLP answers in protobuf, too. The texts in it are legible.
-                Err(wrong) if is_protobuf => String::from_utf8_lossy(wrong.as_bytes()).into_owned(),
-                Err(_) => return Err("an answer that is no text".to_owned()),
-            };
-            Ok(Answer {
-                status,
-                content_type,
-                body,
-            })
+        let request = request.body(body).map_err(|error| error.to_string())?;
+        let text = |error: HttpError| error.to_string();
+        let connection = Connection::open(stream).await.map_err(text)?;
+        let response = connection.send(request, MOST_BYTES).await.map_err(text)?;
+        let status = response.status().as_u16();
+        let content_type = response.headers().get(CONTENT_TYPE);
+        let content_type = content_type.and_then(|value| value.to_str().ok());
+        let content_type = content_type.unwrap_or_default().to_owned();
+        let body = match String::from_utf8(response.into_body().into()) {
+            Ok(body) => body,
+            // A collector of OTLP answers in protobuf, too. The texts in it are legible.
+            Err(wrong) if is_protobuf => String::from_utf8_lossy(wrong.as_bytes()).into_owned(),
+            Err(_) => return Err("an answer that is no text".to_owned()),
         };
-        tokio::pin!(connection, answer);
-        tokio::select! {
-            biased;
-            answer = &mut answer => answer,
-            // The connection ends when the last byte is read, possibly before the response is
-            // complete.
-            ended = &mut connection => {
-                ended.map_err(text)?;
-                answer.await
-            }
-        }
+        Ok(Answer {
+            status,
+            content_type,
+            body,
+        })
     }
 
     fn prefix_path(&self) -> String {

@@ -4,12 +4,9 @@ use std::fmt;
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_body_util::{BodyExt as _, Full, Limited};
-use hyper::header::{CONTENT_TYPE, HOST};
-use hyper::{Request, Response, body::Incoming};
-use hyper_util::rt::TokioIo;
+use http_client::header::{CONTENT_TYPE, HOST};
+use http_client::{Connection, Request, Response};
 use serde_json::Value;
-use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout_at};
 
 use crate::modbus::connected;
@@ -92,23 +89,20 @@ impl Host {
             let stream = connected(&self.0)
                 .await
                 .map_err(|error| unreachable(&error))?;
-            hyper::client::conn::http1::handshake(TokioIo::new(stream))
+            Connection::open(stream)
                 .await
                 .map_err(|error| unreachable(&error))
         };
-        let (mut send, connection) = timeout_at(until, connecting)
+        let connection = timeout_at(until, connecting)
             .await
             .map_err(|_| Fault::Unreachable(late()))??;
-        // Ends with this request.
-        let mut driving = JoinSet::new();
-        driving.spawn(connection);
         let body = asked.body.map(Value::to_string).unwrap_or_default();
         let request = Request::builder()
             .method(asked.method)
             .uri(asked.path)
             .header(HOST, &self.0)
             .header(CONTENT_TYPE, "application/json")
-            .body(Full::new(Bytes::from(body)))
+            .body(Bytes::from(body))
             .map_err(|error| {
                 Fault::Unreachable(format!("{} cannot be asked for: {error}", asked.path))
             })?;
@@ -116,22 +110,15 @@ impl Host {
             let why = "Halt came before the request was sent".to_owned();
             return Err(Fault::Unreachable(why));
         }
-        let answering = async {
-            let answer = send.send_request(request).await;
-            self.read(answer.map_err(|error| self.damaged(&error))?)
-                .await
-        };
-        timeout_at(until, answering)
+        let answer = timeout_at(until, connection.send(request, LONGEST))
             .await
-            .map_err(|_| Fault::Lost(late()))?
+            .map_err(|_| Fault::Lost(late()))?;
+        self.read(&answer.map_err(|error| self.damaged(&error))?)
     }
 
-    async fn read(&self, answer: Response<Incoming>) -> Result<Value, Fault> {
-        let status = answer.status();
-        let body = Limited::new(answer.into_body(), LONGEST).collect().await;
-        let body = body.map_err(|error| self.damaged(&error))?;
-        let bytes = body.to_bytes();
-        let json = serde_json::from_slice::<Value>(&bytes);
+    fn read(&self, answer: &Response<Bytes>) -> Result<Value, Fault> {
+        let (status, bytes) = (answer.status(), answer.body());
+        let json = serde_json::from_slice::<Value>(bytes);
         if !status.is_success() {
             let message = json.ok().and_then(|json| {
                 let message = json.get("message")?.as_str()?;

@@ -11,7 +11,7 @@ use bridge_node::{
     Arguments, Arrival, Context, Delivery, Described, FailureKind, NodeSetReader, Owned, Port,
     PortEvent, Program, TypePaths, now,
 };
-use hyper::body::Bytes;
+use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
 use tokio::time::{Instant, sleep_until};
 use uadp::{BuiltinType, Timestamp};
