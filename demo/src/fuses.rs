@@ -154,7 +154,10 @@ fn insertion(arm: &'static str, steps: Vec<StepRun>) -> Insertion {
     let tries = steps.iter().filter(|step| step.step.starts_with("insert"));
     let blocked = |step: &&StepRun| step.results.get("ForceExceeded") == Some(&Json::Bool(true));
     let (count, resisted) = (tries.clone().count(), tries.clone().filter(blocked).count());
-    let last = tries.clone().next_back().and_then(|step| step.results.get("Position"));
+    let last = tries
+        .clone()
+        .next_back()
+        .and_then(|step| step.results.get("Position"));
     let height = last.and_then(|position| position.get(2)?.as_f64());
     let first = steps.iter().map(|step| step.started_ms).min();
     let last = steps.iter().filter_map(|step| step.ended_ms).max();

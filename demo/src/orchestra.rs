@@ -19,7 +19,7 @@ use crate::line::{DOMAIN, ENDPOINT};
 use crate::pace::{Speed, overdue_after};
 use crate::stage::{
     Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, address,
-    find, free_port, must_be_free, open_when_served, status_of,
+    exit_code, find, free_port, must_be_free, open_when_served, status_of,
 };
 
 /// The options of the scenario.
@@ -41,12 +41,7 @@ pub(crate) async fn play(plan: Plan) -> u8 {
     let mut hops = Hops::default();
     let outcome = perform(plan, &mut timeline, &mut story, &mut hops).await;
     let printed = conclude(plan, &mut timeline, (&story, hops), outcome.as_ref().err());
-    match (outcome, printed) {
-        (Err(failure), _) => failure.exit_code(),
-        // Standard output is closed, for example by `| head`.
-        (Ok(()), Err(_)) => 74,
-        (Ok(()), Ok(())) => 0,
-    }
+    exit_code(&outcome, &printed)
 }
 
 fn conclude(
@@ -57,20 +52,9 @@ fn conclude(
 ) -> std::io::Result<()> {
     timeline.print_all(&|at| story.seconds(at))?;
     let report = report::Report::of(story, hops);
-    if story.delivered() > 0 {
-        timeline.print_text(&report.table(story))?;
-    }
-    if let Some(failure) = failure {
-        timeline.print_text(&format!("error: {failure}\n"))?;
-    }
-    if plan.json {
-        use std::io::Write as _;
-        let mut out = std::io::stdout().lock();
-        serde_json::to_writer(&mut out, &report)?;
-        out.write_all(b"\n")?;
-        out.flush()?;
-    }
-    Ok(())
+    let table = (story.delivered() > 0).then(|| report.table(story));
+    let failure = failure.map(ToString::to_string);
+    timeline.conclude(table.as_deref(), failure.as_deref(), (&report, plan.json))
 }
 
 async fn perform(

@@ -43,7 +43,7 @@ use crate::line::DOMAIN;
 use crate::pace::Speed;
 use crate::stage::{
     Failure, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, address,
-    command, find, free_port, must_be_free, open_when_served, status_of,
+    command, exit_code, find, free_port, must_be_free, open_when_served, status_of,
 };
 
 /// The options of the scenario.
@@ -81,12 +81,7 @@ pub(crate) async fn play(plan: Plan) -> u8 {
         failure.map(ToString::to_string),
     );
     let printed = conclude(&mut show, &report, failure, plan.json);
-    match (outcome, printed) {
-        (Err(failure), _) => failure.exit_code(),
-        // Standard output is closed, for example by `| head`.
-        (Ok(()), Err(_)) => 74,
-        (Ok(()), Ok(())) => 0,
-    }
+    exit_code(&outcome, &printed)
 }
 
 fn conclude(
@@ -96,20 +91,10 @@ fn conclude(
     json: bool,
 ) -> std::io::Result<()> {
     show.print(None)?;
-    if show.story.act() > Act::Cell {
-        show.timeline.print_text(&report.table())?;
-    }
-    if let Some(failure) = failure {
-        show.timeline.print_text(&format!("error: {failure}\n"))?;
-    }
-    if json {
-        use std::io::Write as _;
-        let mut out = std::io::stdout().lock();
-        serde_json::to_writer(&mut out, report)?;
-        out.write_all(b"\n")?;
-        out.flush()?;
-    }
-    Ok(())
+    let table = (show.story.act() > Act::Cell).then(|| report.table());
+    let failure = failure.map(ToString::to_string);
+    show.timeline
+        .conclude(table.as_deref(), failure.as_deref(), (report, json))
 }
 
 /// The story and its timeline.

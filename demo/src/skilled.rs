@@ -41,7 +41,7 @@ use crate::line::DOMAIN;
 use crate::pace::Speed;
 use crate::stage::{
     Failure, Hops, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Stop, Timeline,
-    Who, address, fetch, find, free_port, must_be_free, open_when_served, status_of,
+    Who, address, exit_code, fetch, find, free_port, must_be_free, open_when_served, status_of,
 };
 
 /// The options of the scenario.
@@ -72,12 +72,7 @@ pub(crate) async fn play(plan: Plan) -> u8 {
         report.finished = outcome.is_ok();
         report.failure = outcome.as_ref().err().map(ToString::to_string);
     }
-    match (outcome, show.conclude(plan.json)) {
-        (Err(failure), _) => failure.exit_code(),
-        // Standard output is closed, for example by `| head`.
-        (Ok(()), Err(_)) => 74,
-        (Ok(()), Ok(())) => 0,
-    }
+    exit_code(&outcome, &show.conclude(plan.json))
 }
 
 /// The printed output.
@@ -128,18 +123,8 @@ impl Show {
 
     fn conclude(&self, json: bool) -> std::io::Result<()> {
         let (mut timeline, report) = (self.timeline.borrow_mut(), self.report.borrow());
-        timeline.print_text(&report.table())?;
-        if let Some(failure) = &report.failure {
-            timeline.print_text(&format!("error: {failure}\n"))?;
-        }
-        if json {
-            use std::io::Write as _;
-            let mut out = std::io::stdout().lock();
-            serde_json::to_writer(&mut out, &*report)?;
-            out.write_all(b"\n")?;
-            out.flush()?;
-        }
-        Ok(())
+        let table = report.table();
+        timeline.conclude(Some(&table), report.failure.as_deref(), (&*report, json))
     }
 }
 

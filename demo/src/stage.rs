@@ -15,7 +15,7 @@ mod timeline;
 
 pub(crate) use beside::{find, free_port, must_be_free};
 pub(crate) use browser::{address, open_when_served, status_of};
-pub(crate) use failure::Failure;
+pub(crate) use failure::{Failure, exit_code};
 pub(crate) use hops::{Hop, Hops, delays, micros};
 pub(crate) use interrupt::Interrupt;
 pub(crate) use mes::{MES_WHO, StepRun};

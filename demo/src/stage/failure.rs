@@ -77,6 +77,16 @@ impl Failure {
     }
 }
 
+/// Returns the exit code of a scenario whose end was printed, or not.
+pub(crate) fn exit_code(outcome: &Result<(), Failure>, printed: &std::io::Result<()>) -> u8 {
+    match (outcome, printed) {
+        (Err(failure), _) => failure.exit_code(),
+        // Standard output is closed, for example by `| head`.
+        (Ok(()), Err(_)) => 74,
+        (Ok(()), Ok(())) => 0,
+    }
+}
+
 fn items(lacks: &[String]) -> String {
     lacks.iter().map(|what| format!("\n  - {what}")).collect()
 }

@@ -1,10 +1,10 @@
 //! The printed output of a scenario: its timeline, and its report at the end.
 
-use std::io::{self, Write as _};
+use std::io;
 
 use serde::Serialize;
 
-use super::{Failure, Timeline, Who};
+use super::{Failure, Timeline, Who, exit_code};
 use crate::clock::{millis, wall_nanos};
 
 /// Prints the events of a scenario, and its report at the end.
@@ -18,7 +18,7 @@ pub(crate) struct Show {
 #[derive(Serialize)]
 struct Ended<'a, R> {
     finished: bool,
-    failure: Option<String>,
+    failure: Option<&'a str>,
     #[serde(flatten)]
     report: &'a R,
 }
@@ -56,12 +56,7 @@ impl Show {
         table: &str,
     ) -> u8 {
         let printed = self.print(outcome, report, table);
-        match (outcome, printed) {
-            (Err(failure), _) => failure.exit_code(),
-            // Standard output is closed, for example by `| head`.
-            (Ok(()), Err(_)) => 74,
-            (Ok(()), Ok(())) => 0,
-        }
+        exit_code(outcome, &printed)
     }
 
     fn print<R: Serialize>(
@@ -71,21 +66,13 @@ impl Show {
         table: &str,
     ) -> io::Result<()> {
         let failure = outcome.as_ref().err().map(ToString::to_string);
-        self.timeline.print_text(table)?;
-        if let Some(failure) = &failure {
-            self.timeline.print_text(&format!("error: {failure}\n"))?;
-        }
-        if self.json {
-            let ended = Ended {
-                finished: failure.is_none(),
-                failure,
-                report,
-            };
-            let mut out = io::stdout().lock();
-            serde_json::to_writer(&mut out, &ended)?;
-            out.write_all(b"\n")?;
-            out.flush()?;
-        }
-        Ok(())
+        let ended = Ended {
+            finished: failure.is_none(),
+            failure: failure.as_deref(),
+            report,
+        };
+        let text = failure.as_deref();
+        self.timeline
+            .conclude(Some(table), text, (&ended, self.json))
     }
 }

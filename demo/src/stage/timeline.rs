@@ -4,6 +4,8 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::io::{self, IsTerminal as _, Write};
 
+use serde::Serialize;
+
 /// Prints events. Events are delayed for a short time, so that events of different processes can be
 /// sorted.
 pub(crate) struct Timeline {
@@ -73,6 +75,27 @@ impl Timeline {
     pub(crate) fn print_text(&mut self, text: &str) -> io::Result<()> {
         self.out.write_all(text.as_bytes())?;
         self.out.flush()
+    }
+
+    /// Prints the end of a scenario: the table, the failure, and the report as JSON on standard
+    /// output if `json` is set.
+    pub(crate) fn conclude(
+        &mut self,
+        table: Option<&str>,
+        failure: Option<&str>,
+        (report, json): (&impl Serialize, bool),
+    ) -> io::Result<()> {
+        self.print_text(table.unwrap_or_default())?;
+        if let Some(failure) = failure {
+            self.print_text(&format!("error: {failure}\n"))?;
+        }
+        if json {
+            let mut out = io::stdout().lock();
+            serde_json::to_writer(&mut out, report)?;
+            out.write_all(b"\n")?;
+            out.flush()?;
+        }
+        Ok(())
     }
 
     fn print_while(
