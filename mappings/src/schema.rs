@@ -104,9 +104,10 @@ impl Variables {
             Some(_) | None => Vec::new(),
         };
         let numbers = ["integer", "number", "boolean"];
-        match types.contains(&"string") {
-            true => limits_texts(schema),
-            false => types.iter().any(|one| numbers.contains(one)),
+        if types.contains(&"string") {
+            limits_texts(schema)
+        } else {
+            types.iter().any(|one| numbers.contains(one))
         }
     }
 }

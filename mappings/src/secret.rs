@@ -154,9 +154,10 @@ fn user(rest: &str) -> Option<usize> {
 /// Returns the position of the colon after the user or the host; colons of a default and of an IPv6
 /// address do not count.
 fn colon(authority: &str) -> Option<usize> {
-    let host = match authority.starts_with('[') {
-        true => authority.find(']').unwrap_or(0),
-        false => 0,
+    let host = if authority.starts_with('[') {
+        authority.find(']').unwrap_or(0)
+    } else {
+        0
     };
     Some(host + outside(authority.get(host..)?, |c| c == ':')?)
 }

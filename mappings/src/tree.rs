@@ -224,12 +224,11 @@ impl<'t> Builder<'_, 't> {
                 if secret::is_written(&text) {
                     self.secrets.push(place);
                 }
-                let text = match self.is_key() {
-                    true => self.key(text, place),
-                    false => {
-                        self.look_for_bare_variable(&text, style, place);
-                        self.expand(text, place)?
-                    }
+                let text = if self.is_key() {
+                    self.key(text, place)
+                } else {
+                    self.look_for_bare_variable(&text, style, place);
+                    self.expand(text, place)?
                 };
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
@@ -526,9 +525,10 @@ fn syntax(text: &str, error: &ScanError) -> Fault {
     let is_variable = lines
         .iter()
         .any(|(number, line)| *number == place.line && line.contains("${"));
-    let help = match is_variable {
-        true => "put a text with ${NAME} between braces or brackets into quotes: \"${NAME}\"",
-        false => "the document after this position was not checked",
+    let help = if is_variable {
+        "put a text with ${NAME} between braces or brackets into quotes: \"${NAME}\""
+    } else {
+        "the document after this position was not checked"
     };
     fault(place, error.info(), Some(help))
 }

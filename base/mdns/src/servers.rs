@@ -378,12 +378,13 @@ impl Mdns {
                 };
                 if let Some(ours) = self.ours.get(&announcement.instance) {
                     let theirs = &announcement.url;
-                    return match same_place(&ours.place, theirs) {
-                        true => Some(Heard::Announced {
+                    return if same_place(&ours.place, theirs) {
+                        Some(Heard::Announced {
                             announcement,
                             aside,
-                        }),
-                        false => self.conflict(&announcement.instance, theirs),
+                        })
+                    } else {
+                        self.conflict(&announcement.instance, theirs)
                     };
                 }
                 self.doubted.remove(&announcement.instance);
@@ -438,24 +439,22 @@ impl Mdns {
         self.ignored += 1;
         let all = service.get_addresses_v4();
         let is_elsewhere = !all.is_empty() && address(all.clone(), &self.subnets.0).is_none();
-        let cause = match is_elsewhere {
-            true => "address",
-            false => "form",
-        };
+        let cause = if is_elsewhere { "address" } else { "form" };
         let Some(suppressed) = self.ignored_log.admit(cause, Instant::now().into_std()) else {
             return;
         };
         let name: String = service.fullname.chars().take(MOST_NAME).collect();
-        match is_elsewhere {
-            true => info!(
+        if is_elsewhere {
+            info!(
                 ?name, addresses = ?all, interface = %self.interface, suppressed,
                 hint = "to accept servers of this address, give --network, or set server.find_skills.networks in the mapping",
                 "ignored an announcement: its address is in no subnet of the interface"
-            ),
-            false => debug!(
+            )
+        } else {
+            debug!(
                 ?name,
                 suppressed, "ignored an announcement that is not from a server"
-            ),
+            )
         }
     }
 

@@ -68,9 +68,10 @@ impl Url {
 impl std::fmt::Display for Url {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { host, port, path } = self;
-        match host.contains(':') {
-            true => write!(f, "opc.tcp://[{host}]:{port}{path}"),
-            false => write!(f, "opc.tcp://{host}:{port}{path}"),
+        if host.contains(':') {
+            write!(f, "opc.tcp://[{host}]:{port}{path}")
+        } else {
+            write!(f, "opc.tcp://{host}:{port}{path}")
         }
     }
 }

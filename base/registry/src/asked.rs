@@ -202,12 +202,13 @@ impl Asked {
             let what = "a discovery URL contains a space or a control character";
             return Err(RegisterFault::Invalid { what });
         }
-        match self.discovery_urls.iter().all(|url| is_endpoint(url)) {
-            true => Ok(()),
-            false => Err(RegisterFault::Invalid {
+        if self.discovery_urls.iter().all(|url| is_endpoint(url)) {
+            Ok(())
+        } else {
+            Err(RegisterFault::Invalid {
                 what: "a discovery URL is not the URL of a server: use `opc.tcp`, `opc.wss` or `https` with \
                        a host and a port from 1",
-            }),
+            })
         }
     }
 }

@@ -144,9 +144,10 @@ pub(crate) fn place(url: &str) -> String {
         Some((_, port)) => port.bytes().all(|byte| byte.is_ascii_digit()),
         None => false,
     };
-    match has_port {
-        true => format!("{scheme}://{authority}"),
-        false => format!("{scheme}://{authority}:{DEFAULT_PORT}"),
+    if has_port {
+        format!("{scheme}://{authority}")
+    } else {
+        format!("{scheme}://{authority}:{DEFAULT_PORT}")
     }
 }
 

@@ -88,9 +88,10 @@ pub(crate) fn admit(
     }
     let own = senders.get(newcomer.sender).copied().unwrap_or_default();
     if entries.len() < most {
-        return match own >= most / 2 {
-            true => instead(oldest(&|entry| entry.sender == newcomer.sender)),
-            false => AdmissionVerdict::Room,
+        return if own >= most / 2 {
+            instead(oldest(&|entry| entry.sender == newcomer.sender))
+        } else {
+            AdmissionVerdict::Room
         };
     }
     // The sender with the largest share loses an entry.

@@ -311,9 +311,10 @@ impl EndpointWatch {
             (false, Some(pause)) if now < pause.until + FORGET_PAUSE => pause.failures + 1,
             (false, _) => 1,
         };
-        let longest = match has_answered {
-            true => LONGEST_PAUSE_KNOWN,
-            false => LONGEST_PAUSE,
+        let longest = if has_answered {
+            LONGEST_PAUSE_KNOWN
+        } else {
+            LONGEST_PAUSE
         };
         let until = match failures.checked_sub(FAILURES_WITHOUT_PAUSE + 1) {
             None => now,

@@ -238,9 +238,10 @@ fn a_killed_server_is_lost_within_two_seconds_without_a_goodbye() {
     for tenth in 1..100_u32 {
         let time = now + SECOND / 10 * tenth;
         while let Some(probe) = registry.poll_probe(time) {
-            let outcome = match time <= now + SECOND {
-                true => Outcome::Alive { start_time: None },
-                false => Outcome::Silent,
+            let outcome = if time <= now + SECOND {
+                Outcome::Alive { start_time: None }
+            } else {
+                Outcome::Silent
             };
             registry.probed(&probe.url, outcome, time);
         }

@@ -116,9 +116,12 @@ fn forged_names_at_the_endpoint_of_a_live_server_displace_neither_it_nor_a_new_o
     let robot = probed.iter().filter(|url| *url == ROBOT).count();
     assert!((3..=6).contains(&robot), "{robot}");
     let killed = later + SECOND * 5;
-    let refused = |url: &str| match url == ROBOT {
-        true => Outcome::Refused,
-        false => ALIVE,
+    let refused = |url: &str| {
+        if url == ROBOT {
+            Outcome::Refused
+        } else {
+            ALIVE
+        }
     };
     pass(&mut registry, (killed, killed + SECOND * 2), refused);
     assert_eq!(names(&registry), ["gripper"]);

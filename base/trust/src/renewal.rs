@@ -48,9 +48,10 @@ impl Renewal {
     #[must_use]
     pub fn due(&self) -> Duration {
         let life = self.until.saturating_sub(self.from);
-        match self.is_self_made {
-            true => self.from,
-            false => self.from + life / 5 * 4,
+        if self.is_self_made {
+            self.from
+        } else {
+            self.from + life / 5 * 4
         }
     }
 
@@ -74,17 +75,19 @@ impl Renewal {
         if now < next {
             return Step::Wait { until: next };
         }
-        match now > self.until {
-            true => Step::Late,
-            false => Step::Ask,
+        if now > self.until {
+            Step::Late
+        } else {
+            Step::Ask
         }
     }
 
     /// Returns the pause after this number of failures. The pause doubles with each failure.
     fn pause(&self, times: u32) -> Duration {
-        let (first, longest) = match self.is_self_made {
-            true => SELF_MADE_PAUSES,
-            false => PAUSES,
+        let (first, longest) = if self.is_self_made {
+            SELF_MADE_PAUSES
+        } else {
+            PAUSES
         };
         let factor = 1_u32.checked_shl(times.saturating_sub(1));
         first
@@ -106,9 +109,10 @@ impl Renewal {
 pub fn is_near_end(certificate: &Certificate, now: Duration) -> bool {
     let (from, until) = certificate.validity();
     let life = until.saturating_sub(from);
-    let early = match life > YEAR * 2 {
-        true => YEAR.max(life / 5),
-        false => life / 5,
+    let early = if life > YEAR * 2 {
+        YEAR.max(life / 5)
+    } else {
+        life / 5
     };
     now + early >= until
 }

@@ -316,9 +316,10 @@ fn redundant(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> Vec<Str
             return Vec::new();
         };
         if !is_uri(text) || uris.contains(text) {
-            let message = match uris.contains(text) {
-                true => format!("`{}` is the ApplicationUri of two servers", short(text)),
-                false => format!("`{}` is not an ApplicationUri", short(text)),
+            let message = if uris.contains(text) {
+                format!("`{}` is the ApplicationUri of two servers", short(text))
+            } else {
+                format!("`{}` is not an ApplicationUri", short(text))
             };
             findings
                 .error(Code::ApplicationUri, entry.place, message)

@@ -62,9 +62,10 @@ pub(super) fn check(
             continue;
         };
         is_whole &= !fault.is_fatal;
-        let note = match fault.is_fatal {
-            true => findings.error(Code::NodeSet, *place, fault.what),
-            false => findings.warning(Code::NodeSet, *place, fault.what),
+        let note = if fault.is_fatal {
+            findings.error(Code::NodeSet, *place, fault.what)
+        } else {
+            findings.warning(Code::NodeSet, *place, fault.what)
         };
         note.help(fault.help);
     }

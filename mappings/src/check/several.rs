@@ -115,13 +115,14 @@ pub(super) fn leaves(
     let mut all = Vec::new();
     let mut places = Vec::new();
     for one in selected {
-        let selection = match one.is_plain() {
-            true => Selection::Field(one.field.clone()),
-            false => Selection::Value {
+        let selection = if one.is_plain() {
+            Selection::Field(one.field.clone())
+        } else {
+            Selection::Value {
                 field: one.field.clone(),
                 part: one.part.clone(),
                 conversion: one.conversion,
-            },
+            }
         };
         all.extend(shaping::leaves(message_type, &selection, place, findings)?);
         let inside = |leaf: &Leaf| leaf.path == one.field || leaf.is_inside(&one.field);

@@ -273,18 +273,16 @@ impl Shaping {
         let lossy = (from.is_number() && !is_lossless(from, into))
             || (self.scaled && into.is_number() && whole);
         if lossy && !self.said {
-            let message = match self.scaled && from == into {
-                true => format!("scaled values do not fit {} without rounding", into.name()),
-                false => format!("{} has values that do not fit {}", from.name(), into.name()),
+            let message = if self.scaled && from == into {
+                format!("scaled values do not fit {} without rounding", into.name())
+            } else {
+                format!("{} has values that do not fit {}", from.name(), into.name())
             };
-            let help = match way.reads && self.scaled && way.alone && declared.is_none() {
-                true => {
-                    "give the variable `type: Double`, or choose how to treat a value that does not fit: \
+            let help = if way.reads && self.scaled && way.alone && declared.is_none() {
+                "give the variable `type: Double`, or choose how to treat a value that does not fit: \
                      `out_of_range: refuse` or `clamp`"
-                }
-                false => {
-                    "choose how to treat a value that does not fit after rounding: `out_of_range: refuse` or `clamp`"
-                }
+            } else {
+                "choose how to treat a value that does not fit after rounding: `out_of_range: refuse` or `clamp`"
             };
             findings
                 .error(Code::LossyConversion, place, message)

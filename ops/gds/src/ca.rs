@@ -208,9 +208,10 @@ fn serial(which: &str) -> Result<Serial, Failure> {
 
 fn write(file: &Path, issued: &Certificate) -> Result<(), Failure> {
     let is_pem = file.extension().is_some_and(|end| end == "pem");
-    let written = match is_pem {
-        true => fs::write(file, issued.pem()),
-        false => fs::write(file, issued.der()),
+    let written = if is_pem {
+        fs::write(file, issued.pem())
+    } else {
+        fs::write(file, issued.der())
     };
     written.map_err(|error| io_fault(file, &error))
 }

@@ -304,9 +304,10 @@ impl Gds {
             // Trust in an application approves its request, but no further hosts.
             (RequestState::Waiting, CallerStanding::Itself) => {
                 let wanted = asked.request().ok_or(StatusCode::BadNotFound)?;
-                match self.are_confirmed(caller, &record.uri, wanted.hosts())? {
-                    true => self.issue(asked, &caller.user),
-                    false => Err(StatusCode::BadRequestNotComplete.into()),
+                if self.are_confirmed(caller, &record.uri, wanted.hosts())? {
+                    self.issue(asked, &caller.user)
+                } else {
+                    Err(StatusCode::BadRequestNotComplete.into())
                 }
             }
             (RequestState::Waiting, _) => Err(StatusCode::BadRequestNotComplete.into()),
@@ -476,9 +477,10 @@ impl Gds {
 fn is_ours(gds: &Gds, group: &NodeId, wanted: &NodeId) -> Result<(), StatusCode> {
     let is = |given: &NodeId, own: &NodeId| given.is_null() || given == own;
     let all: NodeId = ObjectTypeId::ApplicationCertificateType.into();
-    match is(group, &gds.group()) && (is(wanted, &kind()) || *wanted == all) {
-        true => Ok(()),
-        false => Err(StatusCode::BadInvalidArgument),
+    if is(group, &gds.group()) && (is(wanted, &kind()) || *wanted == all) {
+        Ok(())
+    } else {
+        Err(StatusCode::BadInvalidArgument)
     }
 }
 

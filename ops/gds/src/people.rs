@@ -135,22 +135,21 @@ fn list(folders: &Folders, json: bool) -> Result<(), Failure> {
         let until = own::day(Duration::from_secs(one.until));
         let application = one.application.as_deref();
         let used = one.used.as_ref().map(|used| used.uri.as_str());
-        let text = match json {
-            true => {
-                let json = serde_json::json!({
-                    "invitation": one.number,
-                    "application": application,
-                    "until": until,
-                    "used_by": used,
-                });
-                bridge_node::harmless_json(&json.to_string())
-            }
-            false => format!(
+        let text = if json {
+            let json = serde_json::json!({
+                "invitation": one.number,
+                "application": application,
+                "until": until,
+                "used_by": used,
+            });
+            bridge_node::harmless_json(&json.to_string())
+        } else {
+            format!(
                 "invitation {} {} for {:?} until {until}",
                 one.number,
                 used.map_or_else(|| "open".to_owned(), |used| format!("used by {used:?}")),
                 application.unwrap_or("any application"),
-            ),
+            )
         };
         say(&text)?;
     }
@@ -175,9 +174,10 @@ fn reject(folders: &Folders, number: &str) -> Result<(), Failure> {
     let withdrawn = change(folders, invitations::FILE, |all: &mut Invitations| {
         all.withdraw(number)
     })?;
-    match withdrawn {
-        true => say(&format!("withdrawn: invitation {number}")),
-        false => Err(unknown(number)),
+    if withdrawn {
+        say(&format!("withdrawn: invitation {number}"))
+    } else {
+        Err(unknown(number))
     }
 }
 

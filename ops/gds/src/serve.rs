@@ -285,9 +285,10 @@ pub(crate) fn ensure_own(
     let opened = Pki::open(pki.to_owned()).map_err(|error| io(error.to_string()))?;
     let made = opened.ensure_own_at(&own_uri(), &endpoint.hosts());
     made.map_err(|error| io(error.to_string()))?;
-    match is_new {
-        true => issue_own(store, pki, endpoint, now).map_err(|fault| of_store(&fault)),
-        false => Ok(()),
+    if is_new {
+        issue_own(store, pki, endpoint, now).map_err(|fault| of_store(&fault))
+    } else {
+        Ok(())
     }
 }
 
@@ -303,9 +304,10 @@ fn renew_own(
     let Some(certificate) = own::read(pki) else {
         return Ok(false);
     };
-    let is_due = match certificate.is_self_signed() {
-        true => trust::is_near_end(&certificate, now),
-        false => !matches!(Renewal::of(&certificate).step(now), Step::Wait { .. }),
+    let is_due = if certificate.is_self_signed() {
+        trust::is_near_end(&certificate, now)
+    } else {
+        !matches!(Renewal::of(&certificate).step(now), Step::Wait { .. })
     };
     // If the authority expires first, a renewal would not extend the certificate and be repeated
     // without end.

@@ -84,9 +84,10 @@ impl Gds {
             return Ok(CallerStanding::Stranger);
         };
         let key = certificate.key_fingerprint();
-        match self.is_trusted(&certificate) || self.has_issued(uri, key) {
-            true => Ok(CallerStanding::Itself),
-            false => Ok(CallerStanding::Applicant(key)),
+        if self.is_trusted(&certificate) || self.has_issued(uri, key) {
+            Ok(CallerStanding::Itself)
+        } else {
+            Ok(CallerStanding::Applicant(key))
         }
     }
 
@@ -119,9 +120,10 @@ impl Gds {
     /// # Errors
     /// Returns `BadSecurityModeInsufficient` if others could read the messages.
     pub(crate) fn is_unread(&self, caller: &Caller) -> Result<(), StatusCode> {
-        match caller.encrypted {
-            true => Ok(()),
-            false => Err(StatusCode::BadSecurityModeInsufficient),
+        if caller.encrypted {
+            Ok(())
+        } else {
+            Err(StatusCode::BadSecurityModeInsufficient)
         }
     }
 
@@ -244,9 +246,10 @@ pub(crate) fn number(id: &NodeId) -> Option<u32> {
 /// Logs a fault of the authority and returns the status for the caller.
 pub(crate) fn refused(fault: &AuthorityStoreFault) -> StatusCode {
     warn!("{fault}");
-    match fault.is_io() {
-        true => StatusCode::BadResourceUnavailable,
-        false => StatusCode::BadInvalidArgument,
+    if fault.is_io() {
+        StatusCode::BadResourceUnavailable
+    } else {
+        StatusCode::BadInvalidArgument
     }
 }
 

@@ -81,9 +81,10 @@ impl AuthorityStore {
         }
         // A key without a certificate remains from an interrupted start, and has signed nothing.
         let path = folder.join(KEY);
-        let known = match path.exists() {
-            true => Some(read_key(&path)?),
-            false => None,
+        let known = if path.exists() {
+            Some(read_key(&path)?)
+        } else {
+            None
         };
         let is_new = known.is_none();
         let key = match known {

@@ -218,9 +218,10 @@ impl ServerCopy {
                     node_id: id(path),
                     browse_name,
                     display_name,
-                    type_definition: match is_known {
-                        true => of,
-                        false => ObjectTypeId::BaseObjectType.into(),
+                    type_definition: if is_known {
+                        of
+                    } else {
+                        ObjectTypeId::BaseObjectType.into()
                     },
                     parent: id(&parent),
                     reference: found.reference.into(),

@@ -154,15 +154,17 @@ impl Service for UaStation {
             discovery: self.upper_lds,
         });
         let is_open = self.allow_unsecured || lds.pki.is_none();
-        let usual = match is_open {
-            true => Roles::of(&[Role::Observer, Role::Operator]),
-            false => Roles::of(&[Role::Observer]),
+        let usual = if is_open {
+            Roles::of(&[Role::Observer, Role::Operator])
+        } else {
+            Roles::of(&[Role::Observer])
         };
         let settings = StationSettings {
             anonymous: self.anonymous.unwrap_or(usual),
-            host_names: match self.refuse_other_hosts {
-                true => HostNames::Refuse,
-                false => HostNames::Warn,
+            host_names: if self.refuse_other_hosts {
+                HostNames::Refuse
+            } else {
+                HostNames::Warn
             },
             gds,
             name: self.name,

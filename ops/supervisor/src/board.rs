@@ -399,9 +399,10 @@ impl Entry {
             .map(|source| at.utc.unix_nanos() - source.unix_nanos());
         let delay = delay.and_then(|nanos| self.delays.record(nanos));
         // A view of a large buffer would keep the whole buffer in memory.
-        self.block = match sample.block.len() <= LARGEST_BLOCK {
-            true => sample.block.clone(),
-            false => Bytes::new(),
+        self.block = if sample.block.len() <= LARGEST_BLOCK {
+            sample.block.clone()
+        } else {
+            Bytes::new()
         };
         self.status = sample.status;
         self.source = sample.source;
@@ -483,9 +484,10 @@ fn writable(variable: &Variable) -> Option<(NodeIdText, CallField)> {
     if !is_own || variable.loss.is_some() {
         return None;
     }
-    let field = match is_array {
-        true => CallField::array("value", builtin),
-        false => CallField::scalar("value", builtin),
+    let field = if is_array {
+        CallField::array("value", builtin)
+    } else {
+        CallField::scalar("value", builtin)
     };
     Some((variable.node.clone(), field))
 }

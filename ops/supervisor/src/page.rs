@@ -179,9 +179,10 @@ impl Page {
     pub(crate) fn next_event(&self, viewer: &mut Viewer) -> Option<String> {
         let now = self.at().since;
         // Conditions are read without the lock of the board.
-        let conditions = match viewer.shows_conditions() {
-            true => self.operations.get().map(|one| one.conditions()),
-            false => None,
+        let conditions = if viewer.shows_conditions() {
+            self.operations.get().map(|one| one.conditions())
+        } else {
+            None
         };
         let mut board = self.board();
         if viewer.shows_conditions() {

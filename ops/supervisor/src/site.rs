@@ -100,12 +100,13 @@ impl Site for Page {
     }
 
     fn describe(&self, at: SocketAddr) -> String {
-        let here = match at.ip().is_loopback() {
-            true => format!("page at http://{at}/"),
-            false => format!(
+        let here = if at.ip().is_loopback() {
+            format!("page at http://{at}/")
+        } else {
+            format!(
                 "page at http://127.0.0.1:{}/, for browsers on this host only",
                 at.port()
-            ),
+            )
         };
         match &self.proxy {
             Some(proxy) => format!("{here}, and at {proxy}/ for users who sign in"),
@@ -360,12 +361,13 @@ impl Page {
         let host = headers.get(HOST).and_then(|host| host.to_str().ok());
         let host = host.unwrap_or_default();
         if visit.is_secure {
-            return match self.is_own_name(without_port(host)) {
-                true => Ok((host.to_owned(), Via::Tls)),
-                false => Err(Refusal::new(
+            return if self.is_own_name(without_port(host)) {
+                Ok((host.to_owned(), Via::Tls))
+            } else {
+                Err(Refusal::new(
                     StatusCode::MISDIRECTED_REQUEST,
                     "the page is served by the names in the certificate of the program",
-                )),
+                ))
             };
         }
         if !visit.peer.ip().to_canonical().is_loopback() {
@@ -449,9 +451,10 @@ impl Page {
 /// Checks that a browser may read: on loopback without a proxy every browser may. Otherwise the
 /// request may come from any host, so each user signs in.
 fn check_reader(browser: &Browser) -> Result<(), Refusal> {
-    match !browser.via.is_remote() || browser.session.is_some() {
-        true => Ok(()),
-        false => Err(Refusal::new(StatusCode::UNAUTHORIZED, "sign in first")),
+    if !browser.via.is_remote() || browser.session.is_some() {
+        Ok(())
+    } else {
+        Err(Refusal::new(StatusCode::UNAUTHORIZED, "sign in first"))
     }
 }
 
@@ -468,10 +471,7 @@ fn cookie_name(host: &str, via: Via) -> String {
 impl Browser {
     fn cookie(&self, token: &str, max_age: u32) -> String {
         let name = cookie_name(&self.host, self.via);
-        let secure = match self.via.is_remote() {
-            true => "; Secure",
-            false => "",
-        };
+        let secure = if self.via.is_remote() { "; Secure" } else { "" };
         format!("{name}={token}; Path=/; Max-Age={max_age}; HttpOnly; SameSite=Strict{secure}")
     }
 }

@@ -98,7 +98,7 @@ fn tile(
         "skill": skill,
         "topic": topic.to_string(),
         "type": skill_type,
-        "state": match is_silent { true => json!("no data"), false => get("state") },
+        "state": if is_silent { json!("no data") } else { get("state") },
         "run": get("run"),
         "progress": get("progress"),
         "step": get("step"),

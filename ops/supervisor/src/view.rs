@@ -242,13 +242,15 @@ fn row(topic: TopicId, entry: &mut Entry, now: Duration) -> Value {
     let hz = entry.rate.hz(now);
     let (severity, text) = quality(entry.status, entry.is_silent);
     let has_value = entry.count > 0;
-    let line = match has_value {
-        true => value::line(&entry.block, &entry.description.fields),
-        false => "–".to_owned(),
+    let line = if has_value {
+        value::line(&entry.block, &entry.description.fields)
+    } else {
+        "–".to_owned()
     };
-    let (severity, text) = match has_value {
-        true => (severity, text),
-        false => ("none", "never received"),
+    let (severity, text) = if has_value {
+        (severity, text)
+    } else {
+        ("none", "never received")
     };
     json!({
         "name": entry.name(topic),
@@ -348,9 +350,10 @@ fn topic_view(board: &mut Board, topic: TopicId, now: Duration) -> Value {
     let Some(entry) = board.topics.get_mut(&topic) else {
         return json!({ "topic": text, "known": false, "why": why, "hops": hops });
     };
-    let fields = match entry.block.is_empty() {
-        true => Vec::new(),
-        false => value::fields(&entry.block, &entry.description.fields).unwrap_or_default(),
+    let fields = if entry.block.is_empty() {
+        Vec::new()
+    } else {
+        value::fields(&entry.block, &entry.description.fields).unwrap_or_default()
     };
     let row = row(topic, entry, now);
     json!({

@@ -14,9 +14,10 @@ use crate::live::broker_mapping;
 pub(crate) fn acl(arguments: &Acl) -> Result<(), Failure> {
     let mapping = broker_mapping(&arguments.mapping)?;
     let users = users(&mapping)?;
-    let rules = match arguments.nats {
-        true => nats(&users),
-        false => mosquitto(&users),
+    let rules = if arguments.nats {
+        nats(&users)
+    } else {
+        mosquitto(&users)
     };
     io::stdout().lock().write_all(rules.as_bytes())?;
     Ok(())

@@ -220,12 +220,13 @@ fn fault(
     let opened = message
         .security()
         .is_some_and(|security| security.is_secured());
-    let in_payload = match opened {
-        true => 0,
-        false => offset(message.payload(), stop, |payload| {
+    let in_payload = if opened {
+        0
+    } else {
+        offset(message.payload(), stop, |payload| {
             let datagram = [headers, payload, message.footer()].concat();
             stop_of(&NetworkMessage::decode(&datagram).ok()?, dialect)
-        }),
+        })
     };
     Fault {
         place: match writer_id {

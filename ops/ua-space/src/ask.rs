@@ -121,9 +121,10 @@ async fn path(server: &Server, question: &str, words: &[String]) -> Result<Strin
         };
         pairs.push(pair);
     }
-    let query = match pairs.is_empty() {
-        true => String::new(),
-        false => format!("?{}", pairs.join("&")),
+    let query = if pairs.is_empty() {
+        String::new()
+    } else {
+        format!("?{}", pairs.join("&"))
     };
     Ok(format!("/ask/{}{query}", encoded(question)))
 }
@@ -162,12 +163,11 @@ fn show(answer: &Answer, arguments: &Ask) -> Result<(), Failure> {
     let is_json = answer.content_type.contains("json");
     if arguments.json || !is_json {
         let text = answer.body.trim_end();
-        match is_json {
-            true => writeln!(out, "{}", mappings::harmless_json(text))?,
-            false => {
-                for line in text.lines() {
-                    writeln!(out, "{}", harmless(line))?;
-                }
+        if is_json {
+            writeln!(out, "{}", mappings::harmless_json(text))?
+        } else {
+            for line in text.lines() {
+                writeln!(out, "{}", harmless(line))?;
             }
         }
         return Ok(());

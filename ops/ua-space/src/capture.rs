@@ -96,9 +96,10 @@ impl<R: Read> Capture<R> {
         let header = capture.exact::<20>(0)?;
         // The upper half holds the length of the frame check sequence that follows the packet.
         let [a, b, c, d] = tail(&header);
-        let link_type = match big_endian {
-            true => u16::from_be_bytes([c, d]),
-            false => u16::from_le_bytes([a, b]),
+        let link_type = if big_endian {
+            u16::from_be_bytes([c, d])
+        } else {
+            u16::from_le_bytes([a, b])
         };
         capture.format = Format::Pcap {
             big_endian,
@@ -207,9 +208,10 @@ impl<R: Read> Capture<R> {
             .split_first_chunk::<8>()
             .ok_or("an Interface Description Block that is too short")?;
         let [a, b, _, _, snap_length @ ..] = *head;
-        let link_type = match big_endian {
-            true => u16::from_be_bytes([a, b]),
-            false => u16::from_le_bytes([a, b]),
+        let link_type = if big_endian {
+            u16::from_be_bytes([a, b])
+        } else {
+            u16::from_le_bytes([a, b])
         };
         let Format::PcapNg { interfaces, .. } = &mut self.format else {
             return Ok(None);
@@ -335,9 +337,12 @@ impl Clock {
     /// Reads the clock from the options of an interface.
     fn read(mut options: &[u8], big_endian: bool) -> Self {
         let mut clock = Self::MICROSECONDS;
-        let half = |bytes: [u8; 2]| match big_endian {
-            true => u16::from_be_bytes(bytes),
-            false => u16::from_le_bytes(bytes),
+        let half = |bytes: [u8; 2]| {
+            if big_endian {
+                u16::from_be_bytes(bytes)
+            } else {
+                u16::from_le_bytes(bytes)
+            }
         };
         while let Some((&[a, b, c, d], rest)) = options.split_first_chunk() {
             let length = usize::from(half([c, d]));
@@ -347,9 +352,10 @@ impl Clock {
                 (TIME_RESOLUTION, [resolution, ..]) => clock.resolution = *resolution,
                 (TIME_OFFSET, value) => {
                     if let Some(offset) = value.first_chunk() {
-                        clock.offset = match big_endian {
-                            true => i64::from_be_bytes(*offset),
-                            false => i64::from_le_bytes(*offset),
+                        clock.offset = if big_endian {
+                            i64::from_be_bytes(*offset)
+                        } else {
+                            i64::from_le_bytes(*offset)
                         };
                     }
                 }
@@ -379,9 +385,10 @@ fn missing(original: u32, data: &[u8]) -> usize {
 }
 
 fn word(bytes: [u8; 4], big_endian: bool) -> u32 {
-    match big_endian {
-        true => u32::from_be_bytes(bytes),
-        false => u32::from_le_bytes(bytes),
+    if big_endian {
+        u32::from_be_bytes(bytes)
+    } else {
+        u32::from_le_bytes(bytes)
     }
 }
 
@@ -431,9 +438,12 @@ mod tests {
 
     /// Returns a pcap file with one packet, written by a machine of either byte order.
     fn pcap(magic: [u8; 4], fraction: u32, big_endian: bool) -> Vec<u8> {
-        let order = |number: u32| match big_endian {
-            true => number.to_be_bytes(),
-            false => number.to_le_bytes(),
+        let order = |number: u32| {
+            if big_endian {
+                number.to_be_bytes()
+            } else {
+                number.to_le_bytes()
+            }
         };
         let mut file = magic.to_vec();
         file.extend(order(if big_endian { 0x0002_0004 } else { 0x0004_0002 }));

@@ -141,9 +141,10 @@ fn sum(name: &str, checked: &Checked, spaces: &[SpaceId]) -> String {
         .filter(|space| **space != SpaceId::UA && mapping.space(**space).is_none())
         .map(ToString::to_string)
         .collect();
-    let unknown = match unknown.is_empty() {
-        true => String::new(),
-        false => format!(" (it has no space {})", unknown.join(", ")),
+    let unknown = if unknown.is_empty() {
+        String::new()
+    } else {
+        format!(" (it has no space {})", unknown.join(", "))
     };
     format!("{name} can run{part}{unknown}: {}", parts.join(", "))
 }

@@ -44,9 +44,12 @@ const HEAD: [&str; 7] = [
 
 fn table(entries: &[Entry]) -> Table {
     let mut table = Table::new(HEAD.map(str::to_owned)).yielding([6, 5, 4, 3, 2]);
-    let dash = |text: String| match text.is_empty() {
-        true => "-".to_owned(),
-        false => text,
+    let dash = |text: String| {
+        if text.is_empty() {
+            "-".to_owned()
+        } else {
+            text
+        }
     };
     for entry in entries {
         let shown = entry.shown();

@@ -84,10 +84,7 @@ fn end(bytes: &[u8], stop: Stop, read: &impl Fn(&[u8]) -> Option<Stop>) -> usize
             }
             read(&other) == Some(stop)
         });
-        match stays {
-            true => end = middle,
-            false => before = middle,
-        }
+        if stays { end = middle } else { before = middle }
     }
     end
 }

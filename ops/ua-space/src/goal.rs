@@ -40,12 +40,13 @@ pub(crate) fn goal(arguments: &GoalArguments) -> Result<(), Failure> {
             }
             table.write(&mut out, is_coloured())?;
         }
-        match planned.reachable {
-            true => Ok(()),
-            false => Err(Failure::Failed(format!(
+        if planned.reachable {
+            Ok(())
+        } else {
+            Err(Failure::Failed(format!(
                 "the goal cannot be reached: {}",
                 harmless(planned.reason.as_deref().unwrap_or_default())
-            ))),
+            )))
         }
     })
 }

@@ -99,9 +99,10 @@ pub(crate) fn failure(file: &str, error: CaptureError) -> Failure {
 /// some, because its counts and lengths are small numbers.
 fn text(bytes: &[u8]) -> Option<&str> {
     let control = |byte: &u8| byte.is_ascii_control() && !byte.is_ascii_whitespace();
-    match bytes.iter().any(control) {
-        true => None,
-        false => str::from_utf8(bytes).ok(),
+    if bytes.iter().any(control) {
+        None
+    } else {
+        str::from_utf8(bytes).ok()
     }
 }
 

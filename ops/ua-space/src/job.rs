@@ -22,9 +22,10 @@ pub(crate) fn job(arguments: &JobArguments) -> Result<(), Failure> {
             let answer = change("POST", "/jobs", ("application/json", body.into_bytes()), at)?;
             let started: Started = read(&answer.body)?;
             say(&format!("job {}: started", started.job))?;
-            match wait {
-                true => follow(started.job, at),
-                false => Ok(()),
+            if wait {
+                follow(started.job, at)
+            } else {
+                Ok(())
             }
         }
         JobVerb::List { json, at } => list(*json, at),

@@ -244,13 +244,15 @@ fn configured_size(
     let (mut end, mut short) = (bytes.len(), least.max(bytes.len() - zeros));
     while short < end {
         let middle = short + (end - short) / 2;
-        match complete(middle) {
-            true => end = middle,
-            false => short = middle + 1,
+        if complete(middle) {
+            end = middle
+        } else {
+            short = middle + 1
         }
     }
-    match end < bytes.len() {
-        true => u16::try_from(bytes.len()).ok(),
-        false => None,
+    if end < bytes.len() {
+        u16::try_from(bytes.len()).ok()
+    } else {
+        None
     }
 }

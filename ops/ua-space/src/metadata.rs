@@ -38,16 +38,17 @@ impl MetaDataFile {
     /// Reads entries, or a list of fields that applies to all messages.
     pub(crate) fn read(path: &Path, reading: RawReading) -> Result<Self, Failure> {
         let text = json_file::read(path)?;
-        let read = match is_list_of_fields(&text) {
-            true => serde_json::from_str(&text).map(|meta_data| {
+        let read = if is_list_of_fields(&text) {
+            serde_json::from_str(&text).map(|meta_data| {
                 vec![Entry {
                     publisher_id: None,
                     writer_group_id: None,
                     data_set_writer_id: None,
                     meta_data,
                 }]
-            }),
-            false => json_file::one_or_many(&text),
+            })
+        } else {
+            json_file::one_or_many(&text)
         };
         let name = path.display().to_string();
         let entries = read.map_err(|error| json_file::explain(&name, &error))?;

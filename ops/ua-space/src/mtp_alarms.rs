@@ -59,9 +59,10 @@ impl Part {
             };
             let server = part.server(module, trigger, arguments)?;
             let plain = format!("{}.{}", module.name, alarm.name);
-            let name = match names.insert(plain.clone()) {
-                true => plain,
-                false => format!("{plain} ({})", alarm.id),
+            let name = if names.insert(plain.clone()) {
+                plain
+            } else {
+                format!("{plain} ({})", alarm.id)
             };
             let (data_type, when) = value;
             part.variables.push(Row {

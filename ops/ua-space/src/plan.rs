@@ -150,13 +150,14 @@ fn show(body: &str, is_json: bool) -> Result<(), Failure> {
         }
         table.write(&mut out, is_coloured())?;
     }
-    match planned.complete {
-        true => Ok(()),
-        false => Err(Failure::Failed(format!(
+    if planned.complete {
+        Ok(())
+    } else {
+        Err(Failure::Failed(format!(
             "{} cannot run: {}",
             harmless(&planned.process),
             harmless(&plain(&planned.missing))
-        ))),
+        )))
     }
 }
 

@@ -73,9 +73,10 @@ pub(crate) fn encode(arguments: &Encode) -> Result<(), Failure> {
             };
             Failure::Data(format!("{name}:{number} {wrong}"))
         })?;
-        match arguments.raw {
-            true => out.write_all(&bytes)?,
-            false => writeln!(out, "{}", hex::text(&bytes))?,
+        if arguments.raw {
+            out.write_all(&bytes)?
+        } else {
+            writeln!(out, "{}", hex::text(&bytes))?
         }
     }
     out.flush()?;

@@ -151,9 +151,10 @@ struct Violation {
 fn check(turtle: bool, json: bool, at: &SourceAt) -> Result<(), Failure> {
     let server = Server::parse(&at.mes.url)?;
     look(async {
-        let answer = match turtle {
-            true => server.get_turtle("/report").await?,
-            false => server.get("/report").await?,
+        let answer = if turtle {
+            server.get_turtle("/report").await?
+        } else {
+            server.get("/report").await?
         };
         if answer.status != 200 {
             return Err(refusal(&answer));
@@ -205,10 +206,7 @@ fn conclusion(unchecked: &[String]) -> &'static str {
 
 /// Returns the end of a check, whose violations were printed.
 fn told(conforms: bool) -> Result<(), Failure> {
-    match conforms {
-        true => Ok(()),
-        false => Err(Failure::Told),
-    }
+    if conforms { Ok(()) } else { Err(Failure::Told) }
 }
 
 /// Sends a change. Returns the response, which is no refusal.

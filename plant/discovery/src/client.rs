@@ -338,9 +338,10 @@ async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
     let ip = Url::parse(url).and_then(|url| url.ip());
     let is_here = ip.is_some_and(|ip| ip.to_canonical().is_loopback());
     // An explicit decision on a certificate also applies on this host.
-    match is_here && !refused.may_be_told {
-        true => Ok(None),
-        false => Err(AskFault::Certificate(refused.to_string())),
+    if is_here && !refused.may_be_told {
+        Ok(None)
+    } else {
+        Err(AskFault::Certificate(refused.to_string()))
     }
 }
 

@@ -352,9 +352,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             taken.map_err(|error| bad(error.status(), "no nonce or certificate"))?;
         }
         let asked = Duration::from_millis(request.requested_lifetime.into());
-        let lifetime = match asked.is_zero() {
-            true => MOST_LIFETIME,
-            false => asked.clamp(LEAST_LIFETIME, MOST_LIFETIME),
+        let lifetime = if asked.is_zero() {
+            MOST_LIFETIME
+        } else {
+            asked.clamp(LEAST_LIFETIME, MOST_LIFETIME)
         };
         let revised_lifetime = u32::try_from(lifetime.as_millis()).unwrap_or(u32::MAX);
         let token = ChannelSecurityToken {

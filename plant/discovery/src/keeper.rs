@@ -244,9 +244,10 @@ impl Keeper {
                 announcement,
                 try_at: at + TRY_ASLEEP,
                 pause: TRY_ASLEEP,
-                longest_pause: match had_answered {
-                    true => LONGEST_PAUSE_KNOWN,
-                    false => LONGEST_PAUSE,
+                longest_pause: if had_answered {
+                    LONGEST_PAUSE_KNOWN
+                } else {
+                    LONGEST_PAUSE
                 },
                 forget_at: at + FORGET_ASLEEP,
             };

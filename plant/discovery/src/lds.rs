@@ -724,9 +724,10 @@ impl ListenFault {
             }
             Self::Io(error) => error,
         };
-        let who = match self.is_taken() {
-            true => client::find_servers(endpoint, WHO_LIMIT).await.ok(),
-            false => None,
+        let who = if self.is_taken() {
+            client::find_servers(endpoint, WHO_LIMIT).await.ok()
+        } else {
+            None
         };
         let who = who.and_then(|all| all.into_iter().find(|one| one.is_discovery_server));
         let what = match who {

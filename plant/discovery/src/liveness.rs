@@ -205,9 +205,10 @@ impl Endpoint {
             Reached::Line(line) => {
                 self.lines_left = self.lines_left.saturating_sub(1);
                 self.line = Some(*line);
-                let start_time = match attempt.ask_start {
-                    true => client::start_time(&self.url, START_LIMIT).await.ok(),
-                    false => None,
+                let start_time = if attempt.ask_start {
+                    client::start_time(&self.url, START_LIMIT).await.ok()
+                } else {
+                    None
                 };
                 Outcome::Alive { start_time }
             }

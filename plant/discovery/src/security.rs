@@ -102,9 +102,10 @@ impl ChannelSecurity {
             warn!(untold, "rejected a client: {told}");
         }
         // An untrusted client does not learn which check failed (OPC 10000-4, 6.1.3).
-        match refused.may_be_told {
-            true => Err(refused.status),
-            false => Err(StatusCode::BadSecurityChecksFailed),
+        if refused.may_be_told {
+            Err(refused.status)
+        } else {
+            Err(StatusCode::BadSecurityChecksFailed)
         }
     }
 }

@@ -203,9 +203,10 @@ pub(crate) fn response(
             let results = all.map(|one| {
                 let counts = one.inner_is::<MdnsDiscoveryConfiguration>() && !taken;
                 taken |= counts;
-                match counts {
-                    true => StatusCode::Good,
-                    false => StatusCode::BadNotSupported,
+                if counts {
+                    StatusCode::Good
+                } else {
+                    StatusCode::BadNotSupported
                 }
             });
             let response = RegisterServer2Response {

@@ -302,9 +302,10 @@ impl Servers {
         }
         // A previous server with this name has lost the name.
         self.renamed(&instance);
-        let name = match self.known.contains_key(&instance) {
-            true => format!("{instance} at {url}"),
-            false => instance.clone(),
+        let name = if self.known.contains_key(&instance) {
+            format!("{instance} at {url}")
+        } else {
+            instance.clone()
         };
         let known = Known {
             name: name.clone(),

@@ -324,12 +324,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             Some(certificate) => certificate.as_byte_string() == header.sender_certificate,
             None => true,
         };
-        match same_policy && same_sender {
-            true => Ok(()),
-            false => Err(WireFault::bad(
+        if same_policy && same_sender {
+            Ok(())
+        } else {
+            Err(WireFault::bad(
                 StatusCode::BadSecurityChecksFailed,
                 "the channel belongs to another connection",
-            )),
+            ))
         }
     }
 
@@ -373,9 +374,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
             ));
         }
         // The library may panic on encrypted chunks of unusual length.
-        let verified = catch_unwind(AssertUnwindSafe(|| match channel.is_client_role() {
-            true => channel.verify_and_remove_security(frame),
-            false => channel.verify_and_remove_security_server(frame),
+        let verified = catch_unwind(AssertUnwindSafe(|| {
+            if channel.is_client_role() {
+                channel.verify_and_remove_security(frame)
+            } else {
+                channel.verify_and_remove_security_server(frame)
+            }
         }));
         let chunk = match verified {
             Ok(chunk) => {

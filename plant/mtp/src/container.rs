@@ -201,9 +201,10 @@ mod tests {
             let mut writer = config.wrap(Vec::new());
             writer.write_all(content).unwrap();
             let (plain, descriptor) = writer.finish().unwrap();
-            let packed = match stored {
-                true => plain,
-                false => miniz_oxide::deflate::compress_to_vec(&plain, 6),
+            let packed = if stored {
+                plain
+            } else {
+                miniz_oxide::deflate::compress_to_vec(&plain, 6)
             };
             entry.write_all(&packed).unwrap();
             entry.finish(descriptor).unwrap();

@@ -378,9 +378,10 @@ impl Pea {
             return;
         };
         let is_effective = service.is_automatic && service.is_external;
-        let commands = match self.faults.enables_late && !is_effective {
-            true => 0,
-            false => service.state.commands(),
+        let commands = if self.faults.enables_late && !is_effective {
+            0
+        } else {
+            service.state.commands()
         };
         let state = match (service.state, self.faults.resetting_word) {
             (State::Resetting, Some(word)) => word,

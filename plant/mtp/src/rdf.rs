@@ -343,9 +343,10 @@ impl ModuleStatements<'_> {
         self.text(&iri, v::HAS_VARIABLE_TYPE, parameter.kind.data_type());
         // The module keeps the last given value, and starts with an initial value.
         self.say(&iri, v::IS_REQUIRED, Object::Boolean(false));
-        let kind = match parameter.is_configuration {
-            true => "configuration",
-            false => "procedure",
+        let kind = if parameter.is_configuration {
+            "configuration"
+        } else {
+            "procedure"
         };
         self.text(&iri, v::PARAMETER_KIND, kind);
         if let Some(node) = &parameter.write {

@@ -188,9 +188,10 @@ impl ModuleStatements<'_> {
                 .procedures
                 .iter()
                 .any(|procedure| procedure.is_self_completing);
-            let next = match *state == State::Execute && is_self_completing {
-                true => Some(State::Completing),
-                false => state.next(),
+            let next = if *state == State::Execute && is_self_completing {
+                Some(State::Completing)
+            } else {
+                state.next()
             };
             followers.extend(next.map(|next| ("Done".to_owned(), next, None)));
             for (name, next, command) in followers {

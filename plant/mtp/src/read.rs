@@ -31,17 +31,19 @@ impl Module {
         fetch: &mut dyn FnMut(&str) -> Option<Vec<u8>>,
     ) -> Result<Self, ManifestError> {
         let is_container = container::is_container(file);
-        let unpacked = match is_container {
-            true => Cow::Owned(container::document(file)?),
-            false => Cow::Borrowed(file),
+        let unpacked = if is_container {
+            Cow::Owned(container::document(file)?)
+        } else {
+            Cow::Borrowed(file)
         };
         let mut root = CaexElement::read(&xml_text::decode(&unpacked)?)?;
         let mut missing = Vec::new();
         let mut total = unpacked.len();
         for (reference, line) in references(&root) {
-            let document = match is_container {
-                true => container::named(file, &reference)?,
-                false => fetch(&reference),
+            let document = if is_container {
+                container::named(file, &reference)?
+            } else {
+                fetch(&reference)
             };
             let Some(document) = document else {
                 missing.push((reference, line));
@@ -208,9 +210,10 @@ impl<'a> ElementIndex<'a> {
             }
             let is_first = matches!(element.kind(), "ServiceControl") || kind_of(element).is_some();
             if is_first || is_assembly(element, is_in_list) {
-                let index = match is_first {
-                    true => &mut reading.assemblies,
-                    false => &mut reading.values,
+                let index = if is_first {
+                    &mut reading.assemblies
+                } else {
+                    &mut reading.values
                 };
                 index.entry(&element.id).or_insert(element);
                 // There may be two: in the files that have two, the last attribute is referenced.

@@ -83,11 +83,12 @@ impl Files for Folder {
 }
 
 fn check_size(bytes: u64) -> Result<(), String> {
-    match bytes > MAX_FILE {
-        true => Err(format!(
+    if bytes > MAX_FILE {
+        Err(format!(
             "it has {bytes} bytes, more than the {MAX_FILE} that are read"
-        )),
-        false => Ok(()),
+        ))
+    } else {
+        Ok(())
     }
 }
 

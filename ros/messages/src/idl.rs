@@ -148,9 +148,10 @@ impl<'t> Parser<'t> {
                 }
             }
         }
-        match self.scope.is_empty() {
-            true => Ok(()),
-            false => Err(self.ended()),
+        if self.scope.is_empty() {
+            Ok(())
+        } else {
+            Err(self.ended())
         }
     }
 
@@ -279,10 +280,13 @@ impl<'t> Parser<'t> {
             "long" if self.takes("long") => alone("int64"),
             "long" => alone("int32"),
             "unsigned" if self.takes("short") => alone("uint16"),
-            "unsigned" if self.takes("long") => match self.takes("long") {
-                true => alone("uint64"),
-                false => alone("uint32"),
-            },
+            "unsigned" if self.takes("long") => {
+                if self.takes("long") {
+                    alone("uint64")
+                } else {
+                    alone("uint32")
+                }
+            }
             word @ ("int8" | "uint8" | "int16" | "uint16" | "int32" | "uint32" | "int64"
             | "uint64") => alone(word),
             word @ ("string" | "wstring") => {
@@ -313,9 +317,10 @@ impl<'t> Parser<'t> {
         if of.arity.is_some() {
             return Err(fault(token, "ROS does not support arrays of arrays"));
         }
-        let bound = match self.takes(",") {
-            true => format!("<={}", self.number()?),
-            false => String::new(),
+        let bound = if self.takes(",") {
+            format!("<={}", self.number()?)
+        } else {
+            String::new()
         };
         self.expect(">")?;
         Ok(Type {

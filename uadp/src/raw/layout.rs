@@ -316,9 +316,10 @@ impl<'a> RawField<'a> {
         }
         let one = self.element_size(Form::Standard).unwrap_or_default();
         let all = self.size(Form::Standard).unwrap_or_default();
-        match one.max(all) > MAX_SIZE {
-            true => Err(RawLayoutFault::TooBig),
-            false => Ok(()),
+        if one.max(all) > MAX_SIZE {
+            Err(RawLayoutFault::TooBig)
+        } else {
+            Ok(())
         }
     }
 
@@ -526,9 +527,10 @@ impl<'a> RawStructure<'a> {
             self.plain = None;
         } else {
             self.padded = padded.map(|(sum, size)| sum.saturating_add(size));
-            self.plain = match field.optional {
-                true => None,
-                false => plain.map(|(sum, size)| sum.saturating_add(size)),
+            self.plain = if field.optional {
+                None
+            } else {
+                plain.map(|(sum, size)| sum.saturating_add(size))
             };
             if !field.optional {
                 self.least = self.least.saturating_add(field.least_size());

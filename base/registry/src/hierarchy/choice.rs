@@ -109,9 +109,10 @@ impl Pattern {
     }
 
     fn fits(&self, text: &str) -> bool {
-        match self.is_prefix {
-            true => text.starts_with(&self.text),
-            false => text == self.text,
+        if self.is_prefix {
+            text.starts_with(&self.text)
+        } else {
+            text == self.text
         }
     }
 }

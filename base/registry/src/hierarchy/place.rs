@@ -49,9 +49,10 @@ impl FromStr for Place {
                 && !name.chars().any(char::is_control)
                 && name.trim() == name
         };
-        match text.split('/').count() <= MOST_NAMES && text.split('/').all(fits) {
-            true => Ok(Self(text.to_owned())),
-            false => Err(PlaceFault(text.chars().take(80).collect())),
+        if text.split('/').count() <= MOST_NAMES && text.split('/').all(fits) {
+            Ok(Self(text.to_owned()))
+        } else {
+            Err(PlaceFault(text.chars().take(80).collect()))
         }
     }
 }

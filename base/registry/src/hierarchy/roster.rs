@@ -51,9 +51,10 @@ impl Roster {
         let Some(url) = self.told.remove(source) else {
             return Vec::new();
         };
-        match self.told.values().any(|known| *known == url) {
-            true => Vec::new(),
-            false => vec![Change::Left(url)],
+        if self.told.values().any(|known| *known == url) {
+            Vec::new()
+        } else {
+            vec![Change::Left(url)]
         }
     }
 }

@@ -21,9 +21,10 @@ impl Registry {
     ) -> Result<(), RegisterFault> {
         let most = self.settings.most;
         // A server with a certificate is not limited by the share of an endpoint.
-        let place = match certified {
-            true => String::new(),
-            false => place_of(asked),
+        let place = if certified {
+            String::new()
+        } else {
+            place_of(asked)
         };
         let newcomer = Newcomer {
             place: &place,

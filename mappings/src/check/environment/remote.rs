@@ -72,9 +72,10 @@ fn node(
         );
         return;
     };
-    let (able, word) = match about.written {
-        true => (writable, "written"),
-        false => (readable, "read"),
+    let (able, word) = if about.written {
+        (writable, "written")
+    } else {
+        (readable, "read")
     };
     if !able {
         let message = format!("`{text}` of the server `{server}` cannot be {word}");

@@ -208,9 +208,10 @@ pub(super) fn capabilities(asset: &str, module: &Module) -> Value {
             containers.push(collection(&name, elements));
         }
     }
-    let elements = match containers.is_empty() {
-        true => vec![text("CapabilitySetComment", "the manifest has no services")],
-        false => vec![collection("CapabilitySet", containers)],
+    let elements = if containers.is_empty() {
+        vec![text("CapabilitySetComment", "the manifest has no services")]
+    } else {
+        vec![collection("CapabilitySet", containers)]
     };
     submodel((asset, "CapabilityDescription"), CAPABILITY_ID, elements)
 }
@@ -324,9 +325,10 @@ pub(super) fn content_type(file: &str) -> &'static str {
     let is_container = [".mtp", ".amlx"]
         .iter()
         .any(|ending| file.ends_with(ending));
-    match is_container {
-        true => "application/automationml-amlx+zip",
-        false => "application/automationml-aml+xml",
+    if is_container {
+        "application/automationml-amlx+zip"
+    } else {
+        "application/automationml-aml+xml"
     }
 }
 

@@ -130,9 +130,10 @@ fn repair(findings: &[Finding], root: &Path) {
         match fs::write(&target, format!("{value}\n")) {
             Ok(()) => {
                 let key = path.trim_start_matches("/proc/sys/").replace('/', ".");
-                let lasting = match path.starts_with("/proc/sys/") {
-                    true => format!("; `{key} = {value}` in /etc/sysctl.d keeps it"),
-                    false => String::new(),
+                let lasting = if path.starts_with("/proc/sys/") {
+                    format!("; `{key} = {value}` in /etc/sysctl.d keeps it")
+                } else {
+                    String::new()
                 };
                 warn(&format!(
                     "{path} is {value} until the host restarts{lasting}"

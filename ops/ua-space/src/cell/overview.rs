@@ -178,9 +178,10 @@ fn programs(cell: &Cell) -> Vec<Program> {
         if has_page {
             continue;
         }
-        let spaces: Vec<Option<u16>> = match spaces.is_empty() {
-            true => vec![None],
-            false => spaces.into_iter().map(Some).collect(),
+        let spaces: Vec<Option<u16>> = if spaces.is_empty() {
+            vec![None]
+        } else {
+            spaces.into_iter().map(Some).collect()
         };
         all.extend(spaces.into_iter().map(|space| of_process(process, space)));
     }
@@ -205,9 +206,10 @@ fn of_page(page: &Page) -> Program {
     Program {
         program: page.program.clone(),
         space: Some(page.space.into()),
-        state: match not_ready.is_empty() {
-            true => State::Ready,
-            false => State::NotReady,
+        state: if not_ready.is_empty() {
+            State::Ready
+        } else {
+            State::NotReady
         },
         not_ready,
         waiting_for,

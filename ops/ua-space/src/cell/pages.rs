@@ -144,9 +144,10 @@ impl Page {
 /// Reads the body of a `/status`: an object, or an array with an object for each space.
 pub(crate) fn parse(body: &str) -> Option<Vec<Page>> {
     let value: Value = serde_json::from_str(body).ok()?;
-    let all = match value.is_array() {
-        true => serde_json::from_value(value).ok()?,
-        false => vec![value],
+    let all = if value.is_array() {
+        serde_json::from_value(value).ok()?
+    } else {
+        vec![value]
     };
     let pages = all.into_iter().map(|one| serde_json::from_value(one).ok());
     let pages: Vec<Page> = pages.collect::<Option<_>>()?;

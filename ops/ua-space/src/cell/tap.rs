@@ -99,13 +99,14 @@ async fn pages(arguments: &Tap) -> Result<Vec<Page>, Failure> {
     for url in &arguments.metrics {
         found.extend(pages::of_url(url).await?);
     }
-    match found.is_empty() {
-        false => Ok(found),
-        true => Err(Failure::Unavailable(
+    if found.is_empty() {
+        Err(Failure::Unavailable(
             "no program of this host has --metrics\n  = help: start the bridge with `--metrics \
              127.0.0.1:9101`, or name its address here with --metrics"
                 .to_owned(),
-        )),
+        ))
+    } else {
+        Ok(found)
     }
 }
 
@@ -247,21 +248,18 @@ impl<'a> Told<'a> {
                 continue;
             }
             let program = harmless(&program);
-            match self.arguments.json {
-                true => {
-                    let shown = Shown {
-                        topic: self.topic.to_string(),
-                        program: &program,
-                        event: &event,
-                    };
-                    writeln!(out, "{}", json(&shown)?)?;
-                }
-                false => {
-                    let time = iso_time::of_unix_nanos(i128::from(event.at_us) * 1_000);
-                    let time = time.get(11..26).unwrap_or_default();
-                    let space = event.space;
-                    writeln!(out, "{time}  {program} (space {space})  {}", event.text())?;
-                }
+            if self.arguments.json {
+                let shown = Shown {
+                    topic: self.topic.to_string(),
+                    program: &program,
+                    event: &event,
+                };
+                writeln!(out, "{}", json(&shown)?)?;
+            } else {
+                let time = iso_time::of_unix_nanos(i128::from(event.at_us) * 1_000);
+                let time = time.get(11..26).unwrap_or_default();
+                let space = event.space;
+                writeln!(out, "{time}  {program} (space {space})  {}", event.text())?;
             }
             let count = event.number("count").unwrap_or(1);
             let sum = self.sums.entry((program, event.kind())).or_default();

@@ -286,9 +286,10 @@ async fn reached(places: Vec<Place>) -> Vec<Entry> {
 fn of_scan(scanned: Outcome) -> Vec<Entry> {
     let servers = scanned.servers.into_iter().map(|one| {
         let told = one.described;
-        let kind = match told.application.is_discovery_server {
-            true => Kind::Lds,
-            false => Kind::of_product(&told.product_uri),
+        let kind = if told.application.is_discovery_server {
+            Kind::Lds
+        } else {
+            Kind::of_product(&told.product_uri)
         };
         let mut entry = Entry::new(kind, By::Scan, one.url);
         entry.urls.extend(one.also_at);
@@ -329,9 +330,10 @@ fn of_bridge(heard: HeardBridge) -> Entry {
 /// Returns the entry of an application announced in the group. An application without URLs is not a
 /// server.
 fn application(((space, from), told): (&(u16, String), &live::Application)) -> Entry {
-    let kind = match told.urls.is_empty() {
-        true => Kind::Bridge,
-        false => Kind::of_product(&told.product_uri),
+    let kind = if told.urls.is_empty() {
+        Kind::Bridge
+    } else {
+        Kind::of_product(&told.product_uri)
     };
     let mut entry = Entry::new(kind, By::Group, from.clone());
     if !told.urls.is_empty() {

@@ -147,9 +147,10 @@ impl Entry {
         if (self.kind, other.kind) == (Kind::Bridge, Kind::Bridge) && self.space != other.space {
             return false;
         }
-        match self.uri.is_empty() || other.uri.is_empty() {
-            true => self.urls.iter().any(|url| other.urls.contains(url)),
-            false => self.uri == other.uri,
+        if self.uri.is_empty() || other.uri.is_empty() {
+            self.urls.iter().any(|url| other.urls.contains(url))
+        } else {
+            self.uri == other.uri
         }
     }
 
@@ -157,9 +158,10 @@ impl Entry {
     fn join(&mut self, other: Self) {
         // The finding that reached the program precedes a finding that did not.
         let better = self.fault.is_some() && other.fault.is_none();
-        let (mut first, second) = match better {
-            true => (other, self.clone()),
-            false => (self.clone(), other),
+        let (mut first, second) = if better {
+            (other, self.clone())
+        } else {
+            (self.clone(), other)
         };
         for url in second.urls {
             if !first.urls.contains(&url) {

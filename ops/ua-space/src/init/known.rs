@@ -103,9 +103,10 @@ impl Known {
         let is_name = |c: char| c.is_ascii_alphanumeric() || c == '/' || c == '_';
         let words = comment.split(|c: char| !is_name(c));
         let topics = words.filter(|word| word.starts_with('/') && word.len() > 1);
-        let known = match is_set_aside {
-            true => &mut self.set_aside,
-            false => &mut self.mentioned,
+        let known = if is_set_aside {
+            &mut self.set_aside
+        } else {
+            &mut self.mentioned
         };
         known.extend(topics.map(str::to_owned));
         if let Some(source) = source_in(comment) {
@@ -196,9 +197,12 @@ impl Known {
         }
         let mut plain: String = wanted
             .chars()
-            .map(|c| match c.is_ascii_alphanumeric() {
-                true => c.to_ascii_lowercase(),
-                false => '-',
+            .map(|c| {
+                if c.is_ascii_alphanumeric() {
+                    c.to_ascii_lowercase()
+                } else {
+                    '-'
+                }
             })
             .take(40)
             .collect();

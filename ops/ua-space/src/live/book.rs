@@ -575,9 +575,10 @@ fn quality(message: &DataSetMessage<'_>) -> StatusCode {
         let all = values.filter_map(|value| value.ok()?.value.status);
         worst = all.fold(worst, |worst, status| {
             // The upper two bits are the severity.
-            match status.0 >> 30 > worst.0 >> 30 {
-                true => status,
-                false => worst,
+            if status.0 >> 30 > worst.0 >> 30 {
+                status
+            } else {
+                worst
             }
         });
     }

@@ -354,12 +354,11 @@ impl Asking<'_> {
     /// Prints a JSON object, or the lines for people.
     fn tell(&self, what: &impl Serialize, lines: &str) -> Result<(), Failure> {
         let mut out = io::stdout().lock();
-        match self.arguments.json {
-            true => writeln!(out, "{}", json(what)?)?,
-            false => {
-                for line in lines.lines() {
-                    writeln!(out, "  {}", harmless(line))?;
-                }
+        if self.arguments.json {
+            writeln!(out, "{}", json(what)?)?
+        } else {
+            for line in lines.lines() {
+                writeln!(out, "  {}", harmless(line))?;
             }
         }
         out.flush()?;
@@ -520,9 +519,10 @@ fn refused((topic, described): (TopicId, &Described), answer: &Answer) -> Result
         why = format!("{symbol}: {why}");
     }
     let takes = described.call().map_or(&[][..], |call| &call.request);
-    let help = match why.contains("BadInvalidArgument") && !takes.is_empty() {
-        true => format!("\n  = help: this call takes {}", described::list(takes)),
-        false => String::new(),
+    let help = if why.contains("BadInvalidArgument") && !takes.is_empty() {
+        format!("\n  = help: this call takes {}", described::list(takes))
+    } else {
+        String::new()
     };
     let name = called(topic, described);
     Err(Failure::Failed(format!(

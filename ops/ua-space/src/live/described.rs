@@ -291,9 +291,10 @@ impl Field {
 pub(crate) fn list(fields: &[Field]) -> String {
     let each = fields.iter().map(|field| {
         let text = format!("{}: {}", field.name, field.kind());
-        match field.optional {
-            true => format!("[{text}]"),
-            false => text,
+        if field.optional {
+            format!("[{text}]")
+        } else {
+            text
         }
     });
     each.collect::<Vec<_>>().join(", ")
@@ -428,9 +429,10 @@ fn action(request: &DataSetMetaDataType<'_>) -> Option<Action> {
 
 fn bounded(text: Option<&str>, what: &'static str) -> Result<String, &'static str> {
     let text = text.unwrap_or_default();
-    match text.len() <= MOST_TEXT {
-        true => Ok(text.to_owned()),
-        false => Err(what),
+    if text.len() <= MOST_TEXT {
+        Ok(text.to_owned())
+    } else {
+        Err(what)
     }
 }
 

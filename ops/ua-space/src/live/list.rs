@@ -32,9 +32,10 @@ pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
             return Err(unheard(&live, topic, arguments.seconds));
         };
         let mut out = io::stdout().lock();
-        match arguments.json {
-            true => writeln!(out, "{}", json(&line.shown())?)?,
-            false => out.write_all(line.told().as_bytes())?,
+        if arguments.json {
+            writeln!(out, "{}", json(&line.shown())?)?
+        } else {
+            out.write_all(line.told().as_bytes())?
         }
         Ok(())
     })
@@ -213,10 +214,7 @@ pub(super) fn origin(space: SpaceId) -> &'static str {
 
 impl Line<'_> {
     const fn kind(&self) -> &'static str {
-        match self.is_call {
-            true => "call",
-            false => "value",
-        }
+        if self.is_call { "call" } else { "value" }
     }
 
     /// Returns the display name.

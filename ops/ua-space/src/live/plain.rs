@@ -48,9 +48,10 @@ impl Named {
         let mut text = String::new();
         for (name, value) in &self.0 {
             let plain = |c: char| c.is_alphanumeric() || matches!(c, '_' | '.' | '-' | '[' | ']');
-            let name = match !name.is_empty() && name.chars().all(plain) {
-                true => name.clone(),
-                false => json!(name).to_string(),
+            let name = if !name.is_empty() && name.chars().all(plain) {
+                name.clone()
+            } else {
+                json!(name).to_string()
             };
             text.push_str(&harmless(&format!("{name}: {value}")));
             text.push('\n');

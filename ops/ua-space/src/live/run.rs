@@ -202,9 +202,10 @@ impl Run {
         let since = self.ended.map(|(_, at)| now.saturating_sub(at));
         match (self.succeeded, self.ended) {
             // The last transition may follow the result.
-            (Some(succeeded), _) if stands || since >= Some(LAST) => Some(match succeeded {
-                true => End::Succeeded,
-                false => End::Failed,
+            (Some(succeeded), _) if stands || since >= Some(LAST) => Some(if succeeded {
+                End::Succeeded
+            } else {
+                End::Failed
             }),
             (None, Some((end, _))) if since >= Some(LATE) => Some(end),
             (Some(_) | None, _) if now.saturating_sub(self.heard) >= SILENT => Some(End::Silent),
@@ -261,9 +262,10 @@ impl Step {
                 message,
                 results,
             } => {
-                let mut text = match succeeded {
-                    true => "succeeded".to_owned(),
-                    false => "failed".to_owned(),
+                let mut text = if succeeded {
+                    "succeeded".to_owned()
+                } else {
+                    "failed".to_owned()
                 };
                 if !message.is_empty() {
                     text.push_str(&format!(": {message}"));

@@ -21,9 +21,10 @@ pub(crate) struct Sealing {
 impl Sealing {
     pub(crate) fn read(path: &Path, signs_only: bool) -> Result<Self, Failure> {
         let file = KeyFile::read(path, warn)?;
-        let mode = match signs_only {
-            true => SecurityMode::Sign,
-            false => SecurityMode::SignAndEncrypt,
+        let mode = if signs_only {
+            SecurityMode::Sign
+        } else {
+            SecurityMode::SignAndEncrypt
         };
         let mut sealer = Sealer::new(mode);
         let (token_id, first) = file

@@ -276,9 +276,10 @@ fn table(skills: &[Skill]) -> Table {
         let dash = || "-".to_owned();
         let silent = Duration::try_from_secs_f64(skill.age_s).unwrap_or_default();
         let state = skill.state.clone().unwrap_or_else(dash);
-        let state = match silent > SILENT {
-            true => format!("{state} {} ago", age(silent)),
-            false => state,
+        let state = if silent > SILENT {
+            format!("{state} {} ago", age(silent))
+        } else {
+            state
         };
         let call = skill.calls.get("Start").map(|topic| {
             let takes = skill.takes.as_deref().unwrap_or_default();

@@ -91,9 +91,10 @@ pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
         }
     }
     print(arguments, &programs, &topics, &clocks)?;
-    match is_missing {
-        true => Err(Failure::NotThere),
-        false => Ok(()),
+    if is_missing {
+        Err(Failure::NotThere)
+    } else {
+        Ok(())
     }
 }
 
@@ -141,9 +142,10 @@ impl Samples {
 
     fn take(&mut self, times: Option<Times>) {
         if let (Some(kept), Some(times)) = (&mut self.kept, times) {
-            match kept.len() < MOST_SAMPLES {
-                true => kept.push(times),
-                false => self.left_out += 1,
+            if kept.len() < MOST_SAMPLES {
+                kept.push(times)
+            } else {
+                self.left_out += 1
             }
         }
     }

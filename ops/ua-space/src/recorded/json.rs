@@ -72,9 +72,10 @@ fn data_values<'a>(
     is_delta: bool,
     values: impl Iterator<Item = ((u16, Option<StatusCode>), &'a Variant<'a>)>,
 ) -> Result<(), EncodeError> {
-    let mut frame = match is_delta {
-        true => writer.delta_data_values(header)?,
-        false => writer.data_values(header)?,
+    let mut frame = if is_delta {
+        writer.delta_data_values(header)?
+    } else {
+        writer.data_values(header)?
     };
     for ((index, status), value) in values {
         let value = DataValue {
@@ -82,9 +83,10 @@ fn data_values<'a>(
             status,
             ..DataValue::default()
         };
-        match is_delta {
-            true => frame.changed(index, &value)?,
-            false => frame.value(&value)?,
+        if is_delta {
+            frame.changed(index, &value)?
+        } else {
+            frame.value(&value)?
         }
     }
     frame.finish()

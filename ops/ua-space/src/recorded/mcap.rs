@@ -68,12 +68,13 @@ impl<R: Read> Mcap<R> {
         };
         let mut rest = [0; 4];
         mcap.exact(&mut rest, 0)?;
-        match rest == *b"P0\r\n" {
-            true => Ok(mcap),
-            false => Err(CaptureError::Broken {
+        if rest == *b"P0\r\n" {
+            Ok(mcap)
+        } else {
+            Err(CaptureError::Broken {
                 at: 4,
                 what: "this version of MCAP is not known",
-            }),
+            })
         }
     }
 
@@ -178,9 +179,10 @@ impl<R: Read> Mcap<R> {
     /// Adds the size of a schema or channel.
     const fn weigh(&mut self, size: usize) -> Result<(), &'static str> {
         self.weight = self.weight.saturating_add(size);
-        match self.weight <= MOST_WEIGHT {
-            true => Ok(()),
-            false => Err("more schemas and channels than there is room for"),
+        if self.weight <= MOST_WEIGHT {
+            Ok(())
+        } else {
+            Err("more schemas and channels than there is room for")
         }
     }
 
@@ -241,9 +243,10 @@ impl<R: Read> Mcap<R> {
     /// Fills the bytes. `start` is the offset of the record for errors.
     fn exact(&mut self, bytes: &mut [u8], start: u64) -> Result<(), CaptureError> {
         self.reader.read_exact(bytes).map_err(|error| {
-            match error.kind() == io::ErrorKind::UnexpectedEof {
-                true => CaptureError::CutOff(start),
-                false => CaptureError::Io(error),
+            if error.kind() == io::ErrorKind::UnexpectedEof {
+                CaptureError::CutOff(start)
+            } else {
+                CaptureError::Io(error)
             }
         })?;
         self.at += u64::try_from(bytes.len()).unwrap_or_default();

@@ -620,9 +620,10 @@ fn open_endpoint(
     endpoints: Vec<EndpointDescription>,
     anonymous: bool,
 ) -> Option<EndpointDescription> {
-    let wanted = match anonymous {
-        true => UserTokenType::Anonymous,
-        false => UserTokenType::UserName,
+    let wanted = if anonymous {
+        UserTokenType::Anonymous
+    } else {
+        UserTokenType::UserName
     };
     endpoints.into_iter().find(|endpoint| {
         let known = endpoint.user_identity_tokens.as_ref().is_none_or(|tokens| {

@@ -164,9 +164,10 @@ fn searched(function: Function, text: &str, part: &str) -> XPathValue {
     }
     // An empty part is at the start of each text.
     let (before, after) = text.split_once(part).unwrap_or_default();
-    let found = match function == Function::SubstringAfter {
-        true => after,
-        false => before,
+    let found = if function == Function::SubstringAfter {
+        after
+    } else {
+        before
     };
     XPathValue::Text(found.to_owned())
 }

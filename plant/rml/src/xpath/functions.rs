@@ -34,12 +34,11 @@ pub(super) fn any_pair(comparison: Comparison, a: &[String], b: &[String]) -> bo
             let ascends = matches!(comparison, Comparison::Less | Comparison::LessOrEqual);
             let extreme = |texts: &[String], least: bool| {
                 let numbers = texts.iter().map(|text| to_number(text));
-                numbers
-                    .filter(|number| !number.is_nan())
-                    .reduce(match least {
-                        true => f64::min,
-                        false => f64::max,
-                    })
+                numbers.filter(|number| !number.is_nan()).reduce(if least {
+                    f64::min
+                } else {
+                    f64::max
+                })
             };
             match (extreme(a, ascends), extreme(b, !ascends)) {
                 (Some(a), Some(b)) => holds(comparison, &a, &b),
@@ -85,9 +84,10 @@ pub(super) fn count(number: usize) -> f64 {
 pub(super) fn to_number(text: &str) -> f64 {
     let text = text.trim();
     let is_number = |c: char| c.is_ascii_digit() || c == '.' || c == '-';
-    match text.chars().all(is_number) {
-        true => text.parse().unwrap_or(f64::NAN),
-        false => f64::NAN,
+    if text.chars().all(is_number) {
+        text.parse().unwrap_or(f64::NAN)
+    } else {
+        f64::NAN
     }
 }
 
@@ -105,9 +105,10 @@ pub(super) fn of_number(number: f64) -> String {
 }
 
 pub(super) fn bounded(text: String) -> Result<String, String> {
-    match text.len() > MAX_TEXT {
-        true => Err(format!("a value has more than {MAX_TEXT} bytes")),
-        false => Ok(text),
+    if text.len() > MAX_TEXT {
+        Err(format!("a value has more than {MAX_TEXT} bytes"))
+    } else {
+        Ok(text)
     }
 }
 

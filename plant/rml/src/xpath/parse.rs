@@ -317,9 +317,10 @@ impl Parser<'_> {
     }
 
     fn expect(&mut self, symbol: &str) -> Parsed<()> {
-        match self.take(symbol) {
-            true => Ok(()),
-            false => Err(self.wrong(&format!("`{symbol}`"))),
+        if self.take(symbol) {
+            Ok(())
+        } else {
+            Err(self.wrong(&format!("`{symbol}`")))
         }
     }
 

@@ -64,9 +64,10 @@ fn one<'a>(
     }
     if first == '*' {
         let after = rest.get(1..).unwrap_or_default();
-        return Ok(match ends_operand(before) {
-            true => (TokenKind::Symbol("*"), after),
-            false => (TokenKind::Name(None, "*".to_owned()), after),
+        return Ok(if ends_operand(before) {
+            (TokenKind::Symbol("*"), after)
+        } else {
+            (TokenKind::Name(None, "*".to_owned()), after)
         });
     }
     if let Some(symbol) = SYMBOLS.iter().find(|symbol| rest.starts_with(**symbol)) {

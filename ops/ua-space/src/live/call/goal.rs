@@ -247,9 +247,10 @@ impl Asking<'_> {
                 take(&mut found, parts, (topic, kind), described);
                 hears_feedback |= (topic, kind) == (parts.feedback, Kind::Value);
             }
-            match found.iter().all(Option::is_some) && hears_feedback {
-                true => Go::Enough,
-                false => Go::On,
+            if found.iter().all(Option::is_some) && hears_feedback {
+                Go::Enough
+            } else {
+                Go::On
             }
         };
         let ended = self.live.listen(end, &mut each).await?;
@@ -382,9 +383,10 @@ impl Asking<'_> {
                 }
                 News::Sample(_) | News::Announced { .. } => {}
             }
-            match told.is_empty() && came.is_none() {
-                true => Go::On,
-                false => Go::Enough,
+            if told.is_empty() && came.is_none() {
+                Go::On
+            } else {
+                Go::Enough
             }
         };
         let ended = live.listen(next, &mut each).await?;

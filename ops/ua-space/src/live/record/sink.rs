@@ -36,9 +36,10 @@ impl Sink {
         let name = path.display().to_string();
         let file = OpenOptions::new().write(true).create_new(true).open(path);
         let file = file.map_err(|error| {
-            Failure::Io(match error.kind() == io::ErrorKind::AlreadyExists {
-                true => format!("{name} exists; give the recording another name"),
-                false => format!("cannot create {name}: {error}"),
+            Failure::Io(if error.kind() == io::ErrorKind::AlreadyExists {
+                format!("{name} exists; give the recording another name")
+            } else {
+                format!("cannot create {name}: {error}")
             })
         })?;
         let (queue, parts) = sync_channel(MOST_PARTS);

@@ -42,9 +42,10 @@ impl Clock {
     reason = "the default is exact; other speeds need no nanosecond"
 )]
 fn slower(nanos: i128, speed: f64) -> i128 {
-    match speed == 1.0 {
-        true => nanos,
-        false => (nanos as f64 / speed) as i128,
+    if speed == 1.0 {
+        nanos
+    } else {
+        (nanos as f64 / speed) as i128
     }
 }
 

@@ -255,9 +255,10 @@ impl Contents {
         }
         let announcement = Announcement::decode(message).map_err(|_| LeftOut::Malformed)?;
         if let Announced::ActionMetaData(_) = announcement.announced {
-            return match self.commands {
-                true => Ok(Place::Whole),
-                false => Err(LeftOut::Call),
+            return if self.commands {
+                Ok(Place::Whole)
+            } else {
+                Err(LeftOut::Call)
             };
         }
         let topic = described_topic(&announcement).filter(|topic| topic.space == space);

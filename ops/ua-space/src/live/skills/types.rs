@@ -36,9 +36,10 @@ pub(crate) fn types(arguments: &Types) -> Result<(), Failure> {
             write!(out, "{}", wrapped("", &harmless(&title)))?;
             let skills = harmless(&one.skills.join(", "));
             write!(out, "{}", wrapped("skills: ", &skills))?;
-            match one.fields.is_empty() {
-                true => writeln!(out, "no parameters")?,
-                false => super::info::parameters(one.fields).write(&mut out, is_coloured())?,
+            if one.fields.is_empty() {
+                writeln!(out, "no parameters")?
+            } else {
+                super::info::parameters(one.fields).write(&mut out, is_coloured())?
             }
         }
         Ok(())

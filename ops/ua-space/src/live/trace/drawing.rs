@@ -90,9 +90,10 @@ pub(super) fn svg(delays: &Delays, name_of: &dyn Fn(TopicId) -> Option<String>) 
 }
 
 fn abbreviated(name: &str) -> String {
-    match name.chars().count() > MOST_NAME {
-        true => name.chars().take(MOST_NAME - 1).chain(['…']).collect(),
-        false => name.to_owned(),
+    if name.chars().count() > MOST_NAME {
+        name.chars().take(MOST_NAME - 1).chain(['…']).collect()
+    } else {
+        name.to_owned()
     }
 }
 

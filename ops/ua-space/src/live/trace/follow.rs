@@ -42,10 +42,7 @@ pub(super) fn follow(arguments: &Trace, target: &Target) -> Result<(), Failure> 
                     shown += 1;
                     failed = show(&times, shown == 1, arguments.json).err();
                 }
-                match failed.is_some() {
-                    true => Go::Enough,
-                    false => Go::On,
-                }
+                if failed.is_some() { Go::Enough } else { Go::On }
             })
             .await?;
         if let Some(failure) = failed {

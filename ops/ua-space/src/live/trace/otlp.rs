@@ -46,9 +46,10 @@ pub(super) fn export(arguments: &Trace, url: &str) -> Result<(), Failure> {
     if exporter.lost > 0 {
         warn(&format!("{} traces were not sent", exporter.lost));
     }
-    match exporter.is_sent {
-        true => Ok(()),
-        false => Err(Failure::NotThere),
+    if exporter.is_sent {
+        Ok(())
+    } else {
+        Err(Failure::NotThere)
     }
 }
 
@@ -125,9 +126,10 @@ impl Exporter<'_> {
     /// Sends the metrics of all programs, and the spans of samples.
     async fn round(&mut self, samples: Vec<SampledValue>) {
         let pages = pages(self.arguments).await;
-        let sent = match pages.is_empty() {
-            true => Err("no program of this host has --metrics".to_owned()),
-            false => send(&self.collector, METRICS_PATH, request(&pages, unix_nanos())).await,
+        let sent = if pages.is_empty() {
+            Err("no program of this host has --metrics".to_owned())
+        } else {
+            send(&self.collector, METRICS_PATH, request(&pages, unix_nanos())).await
         };
         self.note(METRICS_PATH, sent);
         if samples.is_empty() {

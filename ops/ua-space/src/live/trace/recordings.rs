@@ -135,9 +135,10 @@ impl Compared {
             )));
         };
         let of = |ip: &IpAddr| self.0.get(ip).map_or(&[][..], Vec::as_slice);
-        let found = match own == other {
-            true => None,
-            false => estimate(of(own), of(other)),
+        let found = if own == other {
+            None
+        } else {
+            estimate(of(own), of(other))
         };
         let Some(estimate) = found else {
             return Err(Failure::Data(format!(

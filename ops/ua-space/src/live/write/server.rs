@@ -178,16 +178,15 @@ async fn node(client: &Client, found: &ServedValue, url: &str) -> Result<NodeId,
     };
     let (name, folders) = parts(&found.described.name);
     let root = NodeId::new(APPLICATION, format!("UaSpace.{}", found.topic.space));
-    let folder = match folders.is_empty() {
-        true => root,
-        false => {
-            let path = folders
-                .iter()
-                .map(|name| QualifiedName::new(APPLICATION, *name));
-            let path: Vec<QualifiedName> = path.collect();
-            let folder = client.translate(&root, &path).await;
-            folder.map_err(|error| failed(error.to_string()))?
-        }
+    let folder = if folders.is_empty() {
+        root
+    } else {
+        let path = folders
+            .iter()
+            .map(|name| QualifiedName::new(APPLICATION, *name));
+        let path: Vec<QualifiedName> = path.collect();
+        let folder = client.translate(&root, &path).await;
+        folder.map_err(|error| failed(error.to_string()))?
     };
     let (_, namespace, identifier) = found.topic.triple();
     let below = client.browse(&folder, Browse::hierarchical()).await;

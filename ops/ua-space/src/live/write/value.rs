@@ -35,9 +35,10 @@ pub(super) fn encoded(given: &[String], fields: &[Field], now: i128) -> Result<V
 fn single(text: &str, field: &Field) -> String {
     let name = &field.name;
     let own = format!("{name}=");
-    let text = match name.is_empty() {
-        true => text,
-        false => text.strip_prefix(&own).unwrap_or(text),
+    let text = if name.is_empty() {
+        text
+    } else {
+        text.strip_prefix(&own).unwrap_or(text)
     };
     // A quoted text of YAML or JSON.
     let quoted = text

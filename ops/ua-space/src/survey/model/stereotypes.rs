@@ -399,9 +399,10 @@ impl Reader {
                 "Ros2Action" => (CallKind::Action, "server", true),
                 _ => continue,
             };
-            let space = match is_ros2 {
-                true => self.space(applied),
-                false => Some(SpaceId::ROS1),
+            let space = if is_ros2 {
+                self.space(applied)
+            } else {
+                Some(SpaceId::ROS1)
             };
             let type_name = self.required(applied, "type");
             let Some(space) = space else {

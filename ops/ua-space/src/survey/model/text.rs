@@ -92,16 +92,15 @@ impl Lexer<'_> {
             };
             let what = match c {
                 c if c.is_whitespace() => continue,
-                '/' if self.takes('/') => match self.takes('*') {
-                    true => {
+                '/' if self.takes('/') => {
+                    if self.takes('*') {
                         self.comment(line)?;
                         continue;
-                    }
-                    false => {
+                    } else {
                         self.while_true(|c| c != '\n');
                         continue;
                     }
-                },
+                }
                 '/' if self.takes('*') => {
                     self.comment(line)?;
                     Lexeme::Comment
