@@ -1,7 +1,9 @@
 //! Findings in a document, rendered as rustc does: code, location, the line with a caret, help.
 
-use std::fmt::{self, Write as _};
+use std::fmt;
 use std::sync::Arc;
+
+use documents::{Excerpt, SourceSpan, printable};
 
 use crate::code::Code;
 use crate::key_text::without_keys;
@@ -74,28 +76,20 @@ impl Diagnostic {
             column,
             len,
         } = &self.at;
-        let width = line.to_string().len();
-        let mut out = format!(
-            "{}[{}]: {}\n",
-            self.severity,
-            self.code,
-            printable(&self.message)
-        );
-        let place = format!("{:width$}--> {}:{line}:{column}\n", "", printable(file));
-        out.push_str(&place);
-        if let Some(text) = line.checked_sub(1).and_then(|n| source.lines().nth(n)) {
-            let (shown, caret, carets) =
-                window(&without_keys(masked(text)), column.saturating_sub(1), *len);
-            let label = self.label.as_deref().map(printable).unwrap_or_default();
-            let pointer = format!("{:caret$}{:^<carets$} {label}", "", "");
-            // A write to a String cannot fail.
-            _ = write!(out, "{:width$} |\n{line} | {shown}\n", "");
-            _ = writeln!(out, "{:width$} | {}", "", pointer.trim_end());
-        }
-        if let Some(help) = &self.help {
-            _ = writeln!(out, "{:width$} = help: {}", "", printable(help));
-        }
-        out
+        let excerpt = Excerpt {
+            severity: &self.severity.to_string(),
+            code: self.code.as_str(),
+            message: &self.message,
+            file,
+            span: SourceSpan {
+                line: *line,
+                column: *column,
+                len: *len,
+            },
+            label: self.label.as_deref(),
+            help: self.help.as_deref(),
+        };
+        excerpt.render(source, |line| without_keys(masked(line)).into_owned())
     }
 }
 
@@ -114,43 +108,6 @@ impl fmt::Display for Diagnostic {
             "{severity}[{code}]: {message} ({file}:{}:{})",
             at.line, at.column
         )
-    }
-}
-
-/// Longest part of a line that is shown.
-const WIDTH: usize = 120;
-
-/// Returns the shown part of a line, the position of the first caret in it, and the number of
-/// carets.
-fn window(text: &str, column: usize, len: usize) -> (String, usize, usize) {
-    let text = text.trim_end();
-    let total = text.chars().count();
-    let start = if column + len <= WIDTH {
-        0
-    } else {
-        column.saturating_sub(WIDTH / 2)
-    };
-    let piece: String = text.chars().skip(start).take(WIDTH).map(visible).collect();
-    let before = if start > 0 { "..." } else { "" };
-    let after = if start + WIDTH < total { "..." } else { "" };
-    let room = WIDTH.saturating_sub(column - start).max(1);
-    let carets = len.min(total.saturating_sub(column)).clamp(1, room);
-    (
-        format!("{before}{piece}{after}"),
-        column - start + before.len(),
-        carets,
-    )
-}
-
-fn printable(text: &str) -> String {
-    text.chars().map(visible).collect()
-}
-
-fn visible(c: char) -> char {
-    match c {
-        '\t' => '\u{2192}',
-        c if crate::is_obeyed(c) => '\u{fffd}',
-        c => c,
     }
 }
 

@@ -16,7 +16,6 @@ mod include;
 mod key_text;
 mod loss;
 mod mapping;
-mod nearest;
 mod node_id;
 mod nodesets;
 mod pattern;
@@ -29,7 +28,6 @@ mod secret;
 mod security;
 mod server_entries;
 mod surroundings;
-mod terminal;
 mod topic;
 mod tree;
 mod unit;
@@ -46,6 +44,7 @@ pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use difference::Difference;
+pub use documents::{harmless_json, is_obeyed, nearest};
 pub use endpoint::Endpoint;
 pub use environment::{Environment, LiveNode, LiveRemote, LiveServer, LiveSpace, LiveTopic};
 
@@ -54,7 +53,6 @@ pub use mapping::{
     Binding, Lasting, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy,
     Server, ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
 };
-pub use nearest::nearest;
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use nodesets::{NodeSetFault, NodeSetNode, NodeSetType, NodeSets};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
@@ -67,6 +65,5 @@ pub use schema::schema;
 pub use secret::masked;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 pub use surroundings::{Readers, Surroundings};
-pub use terminal::{harmless_json, is_obeyed};
 pub use topic::{Part, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

@@ -8,8 +8,8 @@ use schemars::{JsonSchema, Schema, SchemaGenerator};
 
 use crate::code::Code;
 use crate::findings::{Findings, Note};
-use crate::nearest::nearest;
 use crate::tree::{Kind, Node, Place};
+use documents::nearest;
 
 /// Maximum number of nodes that are read: aliases may lead to one node many times.
 const MAX_READ: usize = 4_000_000;
@@ -345,7 +345,7 @@ macro_rules! choice {
                 $(if text == $word { return Some(Self::$variant); })*
                 let message = format!("expected {wanted}, found `{}`", $crate::read::short(text));
                 let note = reader.findings.error($crate::Code::WrongValue, node.place, message);
-                if let Some(near) = $crate::nearest::nearest(text, words) {
+                if let Some(near) = documents::nearest(text, words) {
                     note.help(format!("did you mean `{near}`?"));
                 }
                 None

@@ -10,6 +10,7 @@ use std::cell::Cell;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::rc::Rc;
 
+use documents::SourceSpan;
 use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span as Marks};
 
 use crate::code::Code;
@@ -538,26 +539,12 @@ const LINES_BEFORE: usize = 3;
 
 /// Returns the position of the first line of a marked range.
 fn place(text: &str, marks: Marks) -> Place {
-    let (start, end) = (marks.start, marks.end);
-    let len = if end.line() == start.line() {
-        end.col().saturating_sub(start.col())
-    } else {
-        let rest = start
-            .byte_offset()
-            .and_then(|at| text.get(at..))
-            .unwrap_or_default();
-        rest.lines()
-            .next()
-            .unwrap_or_default()
-            .trim_end()
-            .chars()
-            .count()
-    };
+    let SourceSpan { line, column, len } = SourceSpan::of(text, marks);
     Place {
         file: 0,
-        line: start.line().max(1),
-        column: start.col() + 1,
-        len: len.max(1),
+        line,
+        column,
+        len,
     }
 }
 

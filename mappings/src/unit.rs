@@ -1,7 +1,7 @@
 //! Units of measure by their UNECE code (UN/ECE Recommendation 20), as OPC UA names them (OPC
 //! 10000-8, 5.6.4.3).
 
-use crate::nearest::nearest;
+use documents::nearest;
 
 /// A unit of measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -202,6 +202,7 @@ fn the_page_knows_no_ros_and_opc_ua_library() {
 fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
     for package in [
         "build-info",
+        "documents",
         "mtp",
         "program",
         "registry",

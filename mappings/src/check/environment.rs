@@ -9,10 +9,10 @@ use crate::document::{BindingEntry, Document, VariableEntry};
 use crate::environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
 use crate::findings::Findings;
 use crate::mapping::{Binding, Mapping, ServiceRole, Variable};
-use crate::nearest::nearest;
 use crate::read::{given, short};
 use crate::topic::SpaceId;
 use crate::tree::Place;
+use documents::nearest;
 
 /// Checks the environment. `mapping` is made of `document` and has no errors: it has a variable or
 /// call for each entry, in the same order.

@@ -11,9 +11,9 @@ use super::shaping::{self, Keys, Way};
 use crate::code::Code;
 use crate::document::{AsEntry, BindingEntry, FieldList, PatternEntry};
 use crate::findings::Findings;
-use crate::nearest::nearest;
 use crate::read::{Field, given, short};
 use crate::tree::Place;
+use documents::nearest;
 
 /// Keys of a binding or a pattern that select fields.
 #[derive(Clone, Copy)]

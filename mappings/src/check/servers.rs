@@ -266,7 +266,7 @@ pub(super) fn named<'s>(
         let message = format!("no server is named `{}`", short(name));
         let note = findings.error(Code::RemoteNode, place, message);
         let names = servers.known.iter().map(|server| server.name.as_str());
-        note.help(match crate::nearest::nearest(name, names) {
+        note.help(match documents::nearest(name, names) {
             Some(near) => format!("did you mean `{near}`?"),
             None => format!(
                 "add it: `servers: [{{name: {}, endpoint: opc.tcp://192.168.0.10:4840}}]`",

@@ -20,11 +20,11 @@ use crate::code::Code;
 use crate::document::{self, BindingEntry, Request};
 use crate::findings::Findings;
 use crate::mapping::{ServiceBinding, ServiceRole, Trigger};
-use crate::nearest::nearest;
 use crate::node_id::NodeIdText;
 use crate::read::{At, Field, given, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
+use documents::nearest;
 
 const TIMEOUT: Duration = Duration::from_secs(5);
 const EVERY: Duration = Duration::from_secs(1);

@@ -13,9 +13,9 @@ use super::bindings::told;
 use super::{TypeFiles, TypeOrigin, TypeUse};
 use crate::code::Code;
 use crate::findings::Findings;
-use crate::nearest::nearest;
 use crate::topic::SpaceId;
 use crate::tree::Place;
+use documents::nearest;
 
 /// Builtin type, and `true` for an array.
 pub(super) type ValueType = (BuiltinType, bool);

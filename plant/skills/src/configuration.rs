@@ -226,7 +226,7 @@ impl Configurable {
         let names: Vec<&str> = parameters.iter().map(|of| of.name.as_str()).collect();
         let message = format!("no skill has a parameter `{}`", shortened(wanted));
         let finding = Finding::error(Code::WrongValue, self.place, message);
-        Some(match nearest(wanted, &names) {
+        Some(match nearest(wanted, names.iter().copied()) {
             Some(near) => finding.with_help(format!("did you mean `{near}`?")),
             None => finding,
         })

@@ -422,7 +422,7 @@ fn make_all(
 fn help_for_type(skill_type: &TypeName) -> String {
     let own = skill_type.namespace == NAMESPACE;
     let names: Vec<&str> = model::TYPES.iter().map(|of| of.name).collect();
-    let near = crate::yaml::nearest(&skill_type.name, &names).filter(|_| own);
+    let near = crate::yaml::nearest(&skill_type.name, names.iter().copied()).filter(|_| own);
     match near {
         Some(near) => format!("did you mean `{near}`?"),
         None if own => "types of others are named as nsu=<namespace uri>;<BrowseName>".to_owned(),

@@ -7,7 +7,8 @@ mod findings;
 mod read;
 mod tree;
 
+pub use documents::SourceSpan as Place;
+pub(crate) use documents::nearest;
 pub use findings::{Code, Finding, Findings};
 pub use read::Reader;
-pub(crate) use read::nearest;
-pub use tree::{Kind, Node, Place, parse};
+pub use tree::{Kind, Node, parse};

@@ -7,10 +7,10 @@ use crate::code::Code;
 use crate::document::{CallBindingEntry, CallEntry};
 use crate::environment::{Environment, LiveSpace};
 use crate::findings::Findings;
-use crate::nearest::nearest;
 use crate::read::{given, short};
 use crate::topic::SpaceId;
 use crate::tree::Place;
+use documents::nearest;
 
 pub(super) fn check(
     entry: &CallEntry,

@@ -340,7 +340,7 @@ fn read_skill_name(
     }
     let names: Vec<&str> = skills.iter().map(|skill| skill.name.as_str()).collect();
     let message = format!("the component has no skill `{}`", shortened(text));
-    let help = match crate::yaml::nearest(text, &names) {
+    let help = match crate::yaml::nearest(text, names.iter().copied()) {
         Some(near) => format!("did you mean `{near}`?"),
         None => format!(
             "its skills are {}; `all` counts all of them",
@@ -372,7 +372,7 @@ fn read_device(
     }
     let names: Vec<&str> = known.iter().map(|value| value.name).collect();
     let message = format!("the device has no value `{}`", shortened(text));
-    let help = match crate::yaml::nearest(text, &names) {
+    let help = match crate::yaml::nearest(text, names.iter().copied()) {
         Some(near) => format!("did you mean `{near}`?"),
         None if names.is_empty() => "this kind of device measures nothing".to_owned(),
         None => format!("its values are {}; `all` has all of them", names.join(", ")),

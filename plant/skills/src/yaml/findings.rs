@@ -1,9 +1,9 @@
 //! Errors in a document, formatted like errors of rustc: code, location, the line with a caret, and
 //! help.
 
-use std::fmt::{self, Write as _};
+use std::fmt;
 
-use super::tree::Place;
+use documents::{Excerpt, SourceSpan as Place};
 
 macro_rules! codes {
     ($($name:ident = $text:literal, $explanation:literal;)*) => {
@@ -95,25 +95,16 @@ impl Finding {
     /// characters of the source are replaced, so that a document cannot control the terminal.
     #[must_use]
     pub fn render(&self, file: &str, source: &str) -> String {
-        let Place { line, column, len } = self.place;
-        let width = line.to_string().len();
-        let mut out = format!("error[{}]: {}\n", self.code, printable(&self.message));
-        // Writing to a String cannot fail.
-        _ = writeln!(out, "{:width$}--> {}:{line}:{column}", "", printable(file));
-        if let Some(text) = line.checked_sub(1).and_then(|n| source.lines().nth(n)) {
-            let shown: String = text.trim_end().chars().take(WIDTH).map(visible).collect();
-            let before = column.saturating_sub(1).min(WIDTH);
-            let carets = len.min(WIDTH.saturating_sub(before)).max(1);
-            _ = writeln!(
-                out,
-                "{:width$} |\n{line} | {shown}\n{:width$} | {:before$}{:^<carets$}",
-                "", "", "", ""
-            );
-        }
-        if let Some(help) = &self.help {
-            _ = writeln!(out, "{:width$} = help: {}", "", printable(help));
-        }
-        out
+        let excerpt = Excerpt {
+            severity: "error",
+            code: self.code.as_str(),
+            message: &self.message,
+            file,
+            span: self.place,
+            label: None,
+            help: self.help.as_deref(),
+        };
+        excerpt.render(source, str::to_owned)
     }
 }
 
@@ -191,20 +182,4 @@ impl Extend<Finding> for Findings {
     }
 }
 
-/// Maximum number of characters of a line that is shown.
-const WIDTH: usize = 160;
 const MOST: usize = 200;
-
-fn printable(text: &str) -> String {
-    text.chars().map(visible).collect()
-}
-
-fn visible(c: char) -> char {
-    match c {
-        '\t' => '\u{2192}',
-        c if c.is_control() => '\u{fffd}',
-        // Marks that change the direction of the text around them.
-        '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => '\u{fffd}',
-        c => c,
-    }
-}

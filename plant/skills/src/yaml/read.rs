@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::findings::{Code, Finding, Findings};
-use super::tree::{Kind, Node, Place};
+use super::{Kind, Node, Place, nearest};
 use crate::parameters::shortened;
 
 /// Reads values from nodes and records errors.
@@ -57,7 +57,7 @@ impl<'f> Reader<'f> {
                 Some((_, slot)) => *slot = Some(value).filter(|value| value.kind != Kind::Null),
                 None => {
                     let message = format!("unknown key `{}`", shortened(text));
-                    let near = nearest(text, &keys);
+                    let near = nearest(text, keys);
                     misspelt.extend(near.map(|near| (near, value)));
                     let help = match near {
                         Some(near) => {
@@ -197,52 +197,6 @@ fn list(names: &[&str]) -> String {
     names.join(", ")
 }
 
-/// Returns the known name that differs in a few letters only, if any.
-pub(crate) fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
-    if name.chars().count() > 64 {
-        return None;
-    }
-    let limit = (name.chars().count() / 3).max(1);
-    let distances = known
-        .iter()
-        .map(|candidate| (distance(name, candidate), *candidate));
-    distances
-        .filter(|(distance, _)| *distance <= limit)
-        .min_by_key(|(distance, _)| *distance)
-        .map(|(_, name)| name)
-}
-
-/// Counts the letters to insert, delete, change or swap with their neighbour, ignoring case (the
-/// optimal string alignment distance).
-fn distance(a: &str, b: &str) -> usize {
-    let (a, b) = (a.to_lowercase(), b.to_lowercase());
-    let mut above: Vec<usize> = (0..=b.chars().count()).collect();
-    // The row of the letter before the last, from which a swap of both letters continues.
-    let mut before: Vec<usize> = Vec::new();
-    let mut last = None;
-    for (line, x) in a.chars().enumerate() {
-        let mut row = Vec::with_capacity(above.len());
-        let mut left = line + 1;
-        row.push(left);
-        let mut behind = None;
-        for (at, y) in b.chars().enumerate() {
-            let cell = |row: &[usize], at: usize| row.get(at).copied().unwrap_or(usize::MAX / 2);
-            let mut best = (cell(&above, at) + usize::from(x != y))
-                .min(left + 1)
-                .min(cell(&above, at + 1) + 1);
-            if last == Some(y) && behind == Some(x) {
-                best = best.min(cell(&before, at.saturating_sub(1)) + 1);
-            }
-            row.push(best);
-            left = best;
-            behind = Some(y);
-        }
-        before = std::mem::replace(&mut above, row);
-        last = Some(x);
-    }
-    above.last().copied().unwrap_or_default()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -257,16 +211,5 @@ mod tests {
         ] {
             assert_eq!(parse_duration(wrong), None, "{wrong}");
         }
-    }
-
-    #[test]
-    fn a_misspelt_name_is_known_by_its_letters() {
-        assert_eq!(
-            nearest("capabilties", &["name", "capabilities"]),
-            Some("capabilities")
-        );
-        assert_eq!(nearest("Grasp", &["grasp"]), Some("grasp"));
-        assert_eq!(nearest("tpye", &["name", "type"]), Some("type"));
-        assert_eq!(nearest("speed", &["name", "type"]), None);
     }
 }

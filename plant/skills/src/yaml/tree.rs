@@ -1,28 +1,9 @@
 //! Parses YAML text into a tree of nodes with locations.
 
+use documents::SourceSpan as Place;
 use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span};
 
 use super::findings::{Code, Finding};
-
-/// A location in the text, within one line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Place {
-    /// The line, from 1.
-    pub line: usize,
-    /// The column in characters, from 1.
-    pub column: usize,
-    /// The length in characters, at least 1.
-    pub len: usize,
-}
-
-impl Place {
-    /// The start of the text.
-    pub const START: Self = Self {
-        line: 1,
-        column: 1,
-        len: 1,
-    };
-}
 
 /// A value of the document.
 #[derive(Debug, Clone, PartialEq)]
@@ -124,7 +105,7 @@ pub fn parse(text: &str) -> Result<Node, Finding> {
     let mut builder = Builder::default();
     for event in Parser::new_from_str_with_options(text, options) {
         let (event, marks) = event.map_err(|error| syntax(text, &error))?;
-        let place = place(text, marks);
+        let place = Place::of(text, marks);
         if event.tag().is_some() {
             return Err(not_read(
                 place,
@@ -257,7 +238,7 @@ fn not_read(place: Place, what: &str, help: &str) -> Finding {
 }
 
 fn syntax(text: &str, error: &ScanError) -> Finding {
-    let place = place(text, Span::empty(*error.marker()));
+    let place = Place::of(text, Span::empty(*error.marker()));
     let line = text.lines().nth(place.line - 1).unwrap_or_default();
     let help = if line.trim_start_matches(' ').starts_with('\t') {
         "YAML is indented with spaces, never with tabs"
@@ -265,30 +246,6 @@ fn syntax(text: &str, error: &ScanError) -> Finding {
         "nothing after this place has been checked"
     };
     Finding::error(Code::Syntax, place, error.info()).with_help(help)
-}
-
-/// Returns the location of the first line of a span.
-fn place(text: &str, marks: Span) -> Place {
-    let (start, end) = (marks.start, marks.end);
-    let len = if end.line() == start.line() {
-        end.col().saturating_sub(start.col())
-    } else {
-        let rest = start
-            .byte_offset()
-            .and_then(|at| text.get(at..))
-            .unwrap_or_default();
-        rest.lines()
-            .next()
-            .unwrap_or_default()
-            .trim_end()
-            .chars()
-            .count()
-    };
-    Place {
-        line: start.line().max(1),
-        column: start.col() + 1,
-        len: len.max(1),
-    }
 }
 
 /// Maximum size of a text, in bytes.
