@@ -11,6 +11,7 @@ mod pose;
 mod rtde;
 mod script;
 pub mod simulator;
+mod state;
 pub mod wire;
 
 use std::sync::Arc;
@@ -29,6 +30,7 @@ pub use self::follower::Follower;
 use self::force::Guard;
 pub use self::pose::{of_robot, to_robot};
 use self::rtde::Rtde;
+use self::state::{INPUTS, OUTPUTS, STOPPED, State};
 use self::wire::Value;
 use crate::modbus::connected;
 use crate::sensors::value;
@@ -215,89 +217,6 @@ enum Kind {
     Guarded,
     /// From point to point to positions of the joints.
     Joints,
-}
-
-/// State of the robot.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct State {
-    pose: [f64; 6],
-    speed: f64,
-    mode: i32,
-    safety: i32,
-    /// Whether a program runs.
-    program: bool,
-    /// Position of the speed slider, from 0 to 1.
-    slider: f64,
-    started: i32,
-    done: i32,
-    /// Force and torque at the tool, in the frame of the base.
-    force: [f64; 6],
-    /// Positions of the joints, rad.
-    joints: [f64; 6],
-}
-
-const OUTPUTS: [&str; 10] = [
-    "actual_TCP_pose",
-    "actual_TCP_speed",
-    "robot_mode",
-    "safety_mode",
-    "runtime_state",
-    "target_speed_fraction",
-    "output_int_register_24",
-    "output_int_register_25",
-    "actual_TCP_force",
-    "actual_q",
-];
-const INPUTS: [&str; 2] = ["speed_slider_mask", "speed_slider_fraction"];
-
-impl State {
-    fn of(values: &[Value]) -> Option<Self> {
-        let [
-            Value::Vector(pose),
-            Value::Vector([x, y, z, rx, ry, rz]),
-            Value::I32(mode),
-            Value::I32(safety),
-            Value::U32(runtime),
-            Value::F64(slider),
-            Value::I32(started),
-            Value::I32(done),
-            Value::Vector(force),
-            Value::Vector(joints),
-        ] = values
-        else {
-            return None;
-        };
-        Some(Self {
-            pose: *pose,
-            speed: (x * x + y * y + z * z)
-                .sqrt()
-                .max(LEVER * (rx * rx + ry * ry + rz * rz).sqrt()),
-            mode: *mode,
-            safety: *safety,
-            program: *runtime == PLAYING,
-            slider: *slider,
-            started: *started,
-            done: *done,
-            force: *force,
-            joints: *joints,
-        })
-    }
-
-    /// Returns the reason for which the robot cannot move, if any.
-    fn fit(&self) -> Result<(), String> {
-        let why = match (self.safety, self.mode) {
-            (1 | 2, 7) => return Ok(()),
-            (3, _) => "it is in a protective stop",
-            (5, _) => "a safeguard stops it",
-            (6 | 7, _) => "its emergency stop is pressed",
-            (8 | 9, _) => "its safety system has a fault",
-            (_, ..=2) => "it is starting",
-            (_, 3) => "it is switched off",
-            (_, 4 | 5) => "its brakes are not released",
-            _ => "it is not running",
-        };
-        Err(format!("the robot does not move: {why}"))
-    }
 }
 
 #[async_trait]
@@ -509,14 +428,19 @@ impl Session {
             if at.done == token {
                 return Ok(at);
             }
-            at.fit()?;
+            if let Err(why) = at.fit() {
+                return Err(match at.started == token {
+                    true => self.unfit((motion, work), &why).await,
+                    false => self.withdraw((motion, work), sent, &why).await?,
+                });
+            }
             if let Some(guard) = guard
                 && guard.exceeded(at.force, at.pose)
             {
                 let force = guard.to_string();
                 return self.contact((motion, work), standing, &force).await;
             }
-            if at.started == token && !at.program {
+            if at.started == token && at.runtime == STOPPED {
                 return Err("the program of the robot has ended before its move: another one took its place".to_owned());
             }
             if at.started != token && asked.elapsed() > TAKEN {
@@ -547,6 +471,23 @@ impl Session {
                 (false, true, Some(_)) | (false, false, None) => {}
             }
         }
+    }
+
+    /// Ends the run of a robot that stands by itself, as in a protective stop. Such a stop pauses the
+    /// program, which goes on when the robot is released: then the outcome is unknown. Returns the
+    /// reason.
+    async fn unfit(&mut self, (motion, work): (&Motion, &Work), why: &str) -> String {
+        let program = motion.send(motion.stop_program()).await;
+        let until = Instant::now() + BRAKED;
+        // The connection is not used after a dropped future.
+        while let Ok(Ok(at)) = timeout_at(until, self.state()).await {
+            if at.runtime == STOPPED {
+                return why.to_owned();
+            }
+        }
+        let stopped = program.map_or(NOT_SENT, |_| SENT);
+        let why = format!("{why}, and its program may go on when it is released");
+        unknown(work, &why, stopped).await
     }
 
     /// Stops a program that the robot has not started. The stop program follows on the same
@@ -660,8 +601,6 @@ const HALT_JOINTS: &str = "def ua_halt():\n  stopj(3.0)\nend\n";
 const MOST_TURNED: f64 = std::f64::consts::TAU;
 const SENT: &str = "the stop program is sent";
 const NOT_SENT: &str = "the stop program is not sent";
-/// `runtime_state` of a running program.
-const PLAYING: u32 = 2;
 const HERTZ: f64 = 50.0;
 /// Rate of the state of a move with a force limit, Hz.
 const GUARDED: f64 = 125.0;
@@ -672,8 +611,6 @@ const SETTLED: Duration = Duration::from_millis(60);
 const BRAKED: Duration = Duration::from_millis(700);
 /// Below this speed the robot counts as stopped, m/s.
 const STILL: f64 = 0.001;
-/// Distance from the tool at which its rotation counts as speed, m.
-const LEVER: f64 = 0.1;
 
 #[cfg(test)]
 mod tests;

@@ -63,6 +63,8 @@ struct Robot {
     registers: [i32; 48],
     slider: f64,
     safety: i32,
+    /// Whether the program is paused, as after a protective stop.
+    paused: bool,
     silent: bool,
     /// Number of power-ons; connections of earlier power-ons have ended.
     life: u32,
@@ -90,6 +92,7 @@ impl Simulator {
             registers: [0; 48],
             slider: 1.0,
             safety: NORMAL,
+            paused: false,
             silent: false,
             life: 0,
         };
@@ -123,12 +126,19 @@ impl Simulator {
         self.lock().silent = silent;
     }
 
-    /// Sets or clears a protective stop, as after a contact.
+    /// Sets or clears a protective stop, as after a contact. The running program is paused, and goes
+    /// on after [`play`](Self::play).
     pub fn set_protective_stop(&self, stopped: bool) {
         let mut robot = self.lock();
         robot.safety = if stopped { PROTECTIVE_STOP } else { NORMAL };
-        if stopped {
-            robot.program = None;
+        robot.paused |= stopped && robot.program.is_some();
+    }
+
+    /// Continues a paused program, as an operator does at the robot.
+    pub fn play(&self) {
+        let mut robot = self.lock();
+        if robot.safety == NORMAL {
+            robot.paused = false;
         }
     }
 
@@ -137,6 +147,7 @@ impl Simulator {
     pub fn reboot(&self) {
         let mut robot = self.lock();
         robot.program = None;
+        robot.paused = false;
         robot.registers = [0; 48];
         robot.slider = 1.0;
         robot.switched_on = Instant::now();
@@ -151,6 +162,7 @@ impl Simulator {
         // A new program replaces the running program. The current motion brakes, because the robot
         // takes a moment to stop.
         let motion = robot.program.take().and_then(|program| program.motion);
+        robot.paused = false;
         robot.program = Some(Running {
             waiting: statements.into(),
             motion: motion.map(Motion::interrupted),
@@ -181,10 +193,8 @@ impl Robot {
     }
 
     fn velocity(&self) -> [f64; 6] {
-        let motion = self
-            .program
-            .as_ref()
-            .and_then(|program| program.motion.as_ref());
+        let running = self.program.as_ref().filter(|_| !self.paused);
+        let motion = running.and_then(|program| program.motion.as_ref());
         motion.map_or([0.0; 6], |motion| {
             let scale = self.slider * self.settings.time_scale;
             motion.velocity().map(|part| part * scale)
@@ -196,6 +206,9 @@ impl Robot {
         let now = Instant::now();
         let passed = now.duration_since(self.seen).min(LONGEST);
         self.seen = now;
+        if self.paused {
+            return;
+        }
         let mut left = passed.as_secs_f64() * self.settings.time_scale * self.slider;
         while let Some(program) = &mut self.program {
             if let Some(motion) = &mut program.motion {

@@ -150,7 +150,7 @@ async fn silence_a_protective_stop_and_a_reboot_are_told_and_do_not_last() {
         }
     };
     let told = between(|robot| robot.set_protective_stop(true)).await;
-    assert_eq!(told, "the robot does not move: it is in a protective stop");
+    assert_eq!(told, PAUSED);
     let told = bench.run("LinearMoveSkillType", near).await.message;
     assert_eq!(told, "the robot does not move: it is in a protective stop");
     bench.simulator.set_protective_stop(false);
@@ -165,6 +165,35 @@ async fn silence_a_protective_stop_and_a_reboot_are_told_and_do_not_last() {
     );
     bench.simulator.set_silent(false);
     assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
+}
+
+/// The outcome of a run that a protective stop has paused.
+const PAUSED: &str = "the robot does not move: it is in a protective stop, and its program may go on when it is \
+     released; the outcome is unknown, the stop program is sent";
+
+#[tokio::test]
+async fn a_program_that_a_protective_stop_pauses_is_unknown_because_it_may_go_on() {
+    let bench = bench().await;
+    let far = [-0.4, -0.3, 0.3, 0.0, 0.0, 0.0];
+    let pausing = async {
+        while bench.simulator.pose()[0] > 0.3 {
+            sleep(Duration::from_millis(2)).await;
+        }
+        bench.simulator.set_protective_stop(true);
+    };
+    let (outcome, ()) = tokio::join!(bench.run("LinearMoveSkillType", far), pausing);
+    assert_eq!(outcome.message, PAUSED);
+    assert!(!outcome.succeeded);
+    let there = bench.simulator.pose();
+    assert!(there[0] > far[0], "it is on its way: {there:?}");
+    // The operator releases the robot: it goes on, as the outcome says.
+    bench.simulator.set_protective_stop(false);
+    bench.simulator.play();
+    let until = Instant::now() + Duration::from_secs(10);
+    while bench.simulator.pose() != far && Instant::now() < until {
+        sleep(Duration::from_millis(2)).await;
+    }
+    assert_eq!(bench.simulator.pose(), far);
 }
 
 #[tokio::test]

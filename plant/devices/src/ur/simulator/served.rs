@@ -146,7 +146,8 @@ impl Simulator {
         let mut mode = Vec::new();
         let on_ms = robot.seen.duration_since(robot.switched_on).as_millis();
         mode.extend(u64::try_from(on_ms).unwrap_or(u64::MAX).to_be_bytes());
-        let (protective, runs) = (robot.safety == 3, robot.program.is_some());
+        let runs = robot.program.is_some() && !robot.paused;
+        let protective = robot.safety == 3;
         // Connected, enabled, powered; emergency and protective stop; program running, paused.
         mode.extend([true, true, true, false, protective, runs, false].map(u8::from));
         mode.extend([u8::try_from(robot.mode()).unwrap_or_default(), 0]);

@@ -85,7 +85,13 @@ impl Robot {
         {
             return Value::I32(*register);
         }
-        let runs = self.program.is_some();
+        let runs = self.program.is_some() && !self.paused;
+        // 2: a program runs; 4: it is paused; 1: there is none.
+        let runtime = match (&self.program, self.paused) {
+            (None, _) => 1,
+            (Some(_), false) => 2,
+            (Some(_), true) => 4,
+        };
         match name {
             "timestamp" => Value::F64(self.seen.duration_since(self.switched_on).as_secs_f64()),
             "actual_TCP_pose" | "target_TCP_pose" => Value::Vector(self.pose),
@@ -94,7 +100,7 @@ impl Robot {
             "actual_TCP_force" => Value::Vector(self.force()),
             "robot_mode" => Value::I32(self.mode()),
             "safety_mode" => Value::I32(self.safety),
-            "runtime_state" => Value::U32(if runs { 2 } else { 1 }),
+            "runtime_state" => Value::U32(runtime),
             // Power is on; a program runs.
             "robot_status_bits" => Value::U32(1 | u32::from(runs) << 1),
             "safety_status_bits" => Value::U32(if self.safety == 1 { 1 } else { 1 << 2 }),

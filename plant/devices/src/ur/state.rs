@@ -1,0 +1,94 @@
+//! The state of a robot, as RTDE sends it.
+
+use super::wire::Value;
+
+/// State of the robot.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct State {
+    pub(super) pose: [f64; 6],
+    pub(super) speed: f64,
+    pub(super) mode: i32,
+    pub(super) safety: i32,
+    /// `runtime_state`: the state of the program.
+    pub(super) runtime: u32,
+    /// Position of the speed slider, from 0 to 1.
+    pub(super) slider: f64,
+    pub(super) started: i32,
+    pub(super) done: i32,
+    /// Force and torque at the tool, in the frame of the base.
+    pub(super) force: [f64; 6],
+    /// Positions of the joints, rad.
+    pub(super) joints: [f64; 6],
+}
+
+/// The outputs of RTDE with the state.
+pub(super) const OUTPUTS: [&str; 10] = [
+    "actual_TCP_pose",
+    "actual_TCP_speed",
+    "robot_mode",
+    "safety_mode",
+    "runtime_state",
+    "target_speed_fraction",
+    "output_int_register_24",
+    "output_int_register_25",
+    "actual_TCP_force",
+    "actual_q",
+];
+/// The inputs of RTDE that runs set.
+pub(super) const INPUTS: [&str; 2] = ["speed_slider_mask", "speed_slider_fraction"];
+
+impl State {
+    /// Returns the state in the values of [`OUTPUTS`]; `None` for values of other types.
+    pub(super) fn of(values: &[Value]) -> Option<Self> {
+        let [
+            Value::Vector(pose),
+            Value::Vector([x, y, z, rx, ry, rz]),
+            Value::I32(mode),
+            Value::I32(safety),
+            Value::U32(runtime),
+            Value::F64(slider),
+            Value::I32(started),
+            Value::I32(done),
+            Value::Vector(force),
+            Value::Vector(joints),
+        ] = values
+        else {
+            return None;
+        };
+        Some(Self {
+            pose: *pose,
+            speed: (x * x + y * y + z * z)
+                .sqrt()
+                .max(LEVER * (rx * rx + ry * ry + rz * rz).sqrt()),
+            mode: *mode,
+            safety: *safety,
+            runtime: *runtime,
+            slider: *slider,
+            started: *started,
+            done: *done,
+            force: *force,
+            joints: *joints,
+        })
+    }
+
+    /// Returns the reason for which the robot cannot move, if any.
+    pub(super) fn fit(&self) -> Result<(), String> {
+        let why = match (self.safety, self.mode) {
+            (1 | 2, 7) => return Ok(()),
+            (3, _) => "it is in a protective stop",
+            (5, _) => "a safeguard stops it",
+            (6 | 7, _) => "its emergency stop is pressed",
+            (8 | 9, _) => "its safety system has a fault",
+            (_, ..=2) => "it is starting",
+            (_, 3) => "it is switched off",
+            (_, 4 | 5) => "its brakes are not released",
+            _ => "it is not running",
+        };
+        Err(format!("the robot does not move: {why}"))
+    }
+}
+
+/// `runtime_state` without a program. A paused program is another state.
+pub(super) const STOPPED: u32 = 1;
+/// Distance from the tool at which its rotation counts as speed, m.
+const LEVER: f64 = 0.1;
