@@ -67,7 +67,8 @@ impl Callers {
     }
 
     /// Returns the client of a caller, connected to the same run of the server as the station
-    /// itself.
+    /// itself. The server of the station drops this future at the timeout of the caller, and nothing
+    /// is forwarded then.
     ///
     /// # Errors
     /// There is no such connection.
@@ -127,6 +128,7 @@ impl AllCallers {
 }
 
 const CONNECT_LIMIT: Duration = Duration::from_secs(4);
+/// Longest wait of a caller without a timeout.
 const LONGEST_WAIT: Duration = Duration::from_secs(60);
 
 #[cfg(test)]

@@ -68,6 +68,8 @@ impl Face {
             pki,
             trust_unknown_clients: trust_any,
             clients,
+            // A call that waits for a session at the device is not delivered late.
+            obeys_timeout_hints: true,
             ..ServerConfig::new(&application_uri, &name, endpoint)
         };
         let users = Arc::clone(&admission.users);

@@ -19,11 +19,13 @@
 //! - `callers`: the permissions of callers
 //! - `face`: the servers that show methods
 //! - `board`: the state of both levels
+//! - `budget`: the number of nodes that a face shows
 //! - `tend`: the supervision of a server
 //! - `marks`: the search for a node
 //! - `station`: the complete station
 
 mod board;
+mod budget;
 mod callers;
 mod configure;
 mod copy;

@@ -28,7 +28,7 @@ pub(crate) struct Mirror {
     /// Object and method of its `Configure`.
     pub(crate) configure: Option<(NodeId, NodeId)>,
     /// Number of methods that cannot be forwarded: their arguments are valid only at that server,
-    /// or there are more nodes than [`MOST_NODES`].
+    /// or there are more nodes than [`MOST_NODES`], or than the station shows of all servers.
     pub(crate) methods_kept_back: usize,
     /// Number of variables and objects that cannot be shown, for the same reasons or because they
     /// cannot be read.
@@ -134,6 +134,17 @@ impl Mirror {
     /// Returns the number of variables.
     pub(crate) fn variables(&self) -> usize {
         self.count(|kind| matches!(kind, Kind::Variable { .. }))
+    }
+
+    /// Keeps this number of nodes, and counts the others as not shown. Parents come before their
+    /// children.
+    pub(crate) fn keep(&mut self, most: usize) {
+        let kept_back = self.nodes.get(most..).unwrap_or_default();
+        let is_method = |node: &&Found| matches!(node.kind, Kind::Method { .. });
+        let methods = kept_back.iter().filter(is_method).count();
+        self.methods_kept_back += methods;
+        self.variables_kept_back += kept_back.len() - methods;
+        self.nodes.truncate(most);
     }
 
     fn count(&self, is: impl Fn(&Kind) -> bool) -> usize {
@@ -603,6 +614,40 @@ const WRITABLE: u8 = 2;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn nodes_that_are_not_kept_are_counted_by_their_kind() {
+        let found = |kind: Kind| Found {
+            path: vec!["a".to_owned()],
+            name: Name {
+                uri: None,
+                name: "a".to_owned(),
+            },
+            reference: ReferenceTypeId::HasComponent,
+            id: NodeId::new(1, 1_u32),
+            kind,
+        };
+        let object = || Kind::Object {
+            of: TypeRef::Core(ObjectTypeId::BaseObjectType.into()),
+            events: false,
+        };
+        let method = || Kind::Method {
+            object: NodeId::new(1, 1_u32),
+            takes: Vec::new(),
+            gives: Vec::new(),
+        };
+        let nodes = [object(), object(), method(), method(), object()].map(found);
+        let mut mirror = Mirror {
+            nodes: nodes.into(),
+            ..Mirror::default()
+        };
+        mirror.keep(9);
+        assert_eq!((mirror.nodes.len(), mirror.methods_kept_back), (5, 0));
+        mirror.keep(2);
+        assert_eq!(mirror.nodes.len(), 2);
+        let kept_back = (mirror.methods_kept_back, mirror.variables_kept_back);
+        assert_eq!(kept_back, (2, 1));
+    }
 
     #[test]
     fn a_type_has_one_identity_behind_any_number_of_stations() {

@@ -26,6 +26,7 @@ use tokio::task::AbortHandle;
 use tracing::{info, warn};
 
 use crate::board::{Board, Level};
+use crate::budget::NodeBudget;
 use crate::callers::Admission;
 use crate::configure::Told;
 use crate::face::{Face, FaceSettings, id};
@@ -112,6 +113,7 @@ pub async fn run(
         discovery_url: settings.lds.endpoint.clone(),
         own_uri: uri.clone(),
         registered: watch::Sender::default(),
+        nodes: NodeBudget::default(),
     };
     levels.below = Some(Abort(
         tokio::spawn(tend_below(events, tending)).abort_handle(),
@@ -188,6 +190,7 @@ impl Common<'_> {
             discovery_url: String::new(),
             own_uri: (*uri).to_owned(),
             registered: watch::Sender::default(),
+            nodes: NodeBudget::default(),
         };
         levels.above = Some(follow(upper, tending)?);
         levels.announced = tell(settings, upper, uri, (&above, &below))?;

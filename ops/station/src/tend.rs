@@ -18,6 +18,7 @@ use tokio::time::{Instant, sleep};
 use tracing::{info, warn};
 
 use crate::board::{BUSY, Board, CONNECTED, Level};
+use crate::budget::NodeBudget;
 use crate::callers::Callers;
 use crate::configure::Told;
 use crate::copy::{CopiedVariable, ServerCopy};
@@ -40,6 +41,8 @@ pub(crate) struct Tending {
     pub(crate) own_uri: String,
     /// The URLs of the servers that registered here. Only these are configured with their place.
     pub(crate) registered: watch::Sender<BTreeSet<String>>,
+    /// The nodes that the face shows of all servers.
+    pub(crate) nodes: NodeBudget,
 }
 
 impl Tending {
@@ -115,6 +118,7 @@ impl Tending {
 
     /// Removes the server.
     pub(crate) fn leave(&self, url: &str) {
+        self.nodes.release(url);
         if let Some(name) = self.board.leave(self.level, url)
             && let Some(face) = &self.face
         {
@@ -164,7 +168,8 @@ impl Tending {
             let run = of.client.started();
             // A server that executes a method may not respond to other requests.
             if known.is_none() || !of.client.is_calling() {
-                match mirror::look(of.client).await {
+                let looked = mirror::look(of.client).await;
+                match looked.map(|looked| self.within_budget(of.url, looked)) {
                     Ok(looked) if known.as_ref() != Some(&looked) => {
                         self.show((of, run), &looked, copy.as_mut(), &mut feeds)
                             .await;
@@ -218,6 +223,14 @@ impl Tending {
         }
     }
 
+    /// Keeps the nodes of a server that the face can show beside those of the other servers.
+    fn within_budget(&self, url: &str, mut mirror: Mirror) -> Mirror {
+        let wanted = mirror.nodes.len();
+        let granted = self.nodes.grant(url, wanted);
+        mirror.keep(granted);
+        mirror
+    }
+
     /// Shows the nodes of a server, and repeats its values and events.
     async fn show(
         &self,
@@ -258,11 +271,15 @@ impl Tending {
             peer.methods_kept_back = looked.methods_kept_back;
             peer.variables_kept_back = looked.variables_kept_back;
         });
+        let (methods_kept_back, variables_kept_back) =
+            (looked.methods_kept_back, looked.variables_kept_back);
         info!(
             name = of.name,
             url = of.url,
             methods,
             variables,
+            methods_kept_back,
+            variables_kept_back,
             "showing the methods and values of a server"
         );
     }

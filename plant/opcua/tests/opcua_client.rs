@@ -11,14 +11,21 @@
 mod cell;
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
+use async_trait::async_trait;
 use cell::{Cell, PATIENCE, config, next, next_value, press};
 use opcua::types::{NodeId, ObjectId, QualifiedName, StatusCode, VariableId, Variant};
-use plant_opcua::client::{Client, ClientConfig, ClientError, Link, Notice, SecurityChoice, Watch};
-use plant_opcua::server::{Security, Server, ServerConfig};
+use plant_opcua::client::{
+    CallOptions, Client, ClientConfig, ClientError, Link, Notice, SecurityChoice, Watch,
+};
+use plant_opcua::server::{
+    MethodHandler, MethodRequest, MethodSpec, Refusal, Security, Server, ServerConfig,
+};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
 
 fn quick() -> ClientConfig {
     let mut config = config();
@@ -173,6 +180,75 @@ async fn a_queue_that_is_full_loses_notices_and_counts_them() {
     // The first notices are still in the queue.
     assert_eq!(next(&mut full).await, Notice::Subscribed);
     assert_eq!(roomy.dropped(), 0);
+}
+
+/// A method that waits before it takes effect. The channel has what happened last.
+struct Slow(watch::Sender<&'static str>);
+
+/// Notes that a waiting call is dropped.
+struct Waiting(watch::Sender<&'static str>);
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        self.0.send_if_modified(|last| {
+            let waits = *last == "waits";
+            if waits {
+                *last = "is dropped";
+            }
+            waits
+        });
+    }
+}
+
+#[async_trait]
+impl MethodHandler for Slow {
+    async fn call(&self, _request: MethodRequest) -> Result<Vec<Variant>, Refusal> {
+        self.0.send_replace("waits");
+        let _waiting = Waiting(self.0.clone());
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        self.0.send_replace("has taken effect");
+        Ok(Vec::new())
+    }
+}
+
+#[tokio::test]
+async fn a_call_takes_no_effect_after_its_caller_has_given_up_where_timeout_hints_are_obeyed() {
+    for (obeys_timeout_hints, expected) in [(true, "is dropped"), (false, "has taken effect")] {
+        let config = ServerConfig {
+            obeys_timeout_hints,
+            ..ServerConfig::new(
+                "urn:test:cell",
+                "Cell",
+                "opc.tcp://127.0.0.1:0".parse().unwrap(),
+            )
+        };
+        let cell = Cell::with(config);
+        let (last, mut happened) = watch::channel("nothing");
+        press(&cell.server, 100, &[]);
+        let (object, id) = (NodeId::new(1, 100), NodeId::new(1, 500));
+        let method = MethodSpec {
+            node_id: id.clone(),
+            browse_name: QualifiedName::new(1, "Slow"),
+            object: object.clone(),
+            arguments: (NodeId::new(1, 501), NodeId::new(1, 502)),
+            takes: Vec::new(),
+            gives: Vec::new(),
+        };
+        cell.server
+            .add_method(method, Arc::new(Slow(last)))
+            .unwrap();
+        let client = cell.client().await;
+        let options = CallOptions {
+            within: Duration::from_millis(200),
+            connection: None,
+        };
+        let called = client.call_result((&object, &id), Vec::new(), options);
+        let error = called.await.unwrap_err();
+        assert!(matches!(error, ClientError::Lost(_)), "{error}");
+        let ended = happened.wait_for(|last| !["nothing", "waits"].contains(last));
+        let ended = tokio::time::timeout(PATIENCE, ended).await;
+        assert_eq!(*ended.expect("it waits").unwrap(), expected);
+    }
 }
 
 fn scratch(name: &str) -> PathBuf {

@@ -114,6 +114,10 @@ pub struct ServerConfig {
     pub session_timeout: Duration,
     /// The limits of clients.
     pub clients: ClientLimits,
+    /// Cancels a request at the timeout of its caller (TimeoutHint of OPC 10000-4, 7.33), so that
+    /// a request that waits takes no effect after its caller has given up. Otherwise the timeouts
+    /// of the server apply.
+    pub obeys_timeout_hints: bool,
 }
 
 impl ServerConfig {
@@ -132,6 +136,7 @@ impl ServerConfig {
             unknown_clients: UnknownClients::Refuse,
             session_timeout: Duration::from_secs(60),
             clients: ClientLimits::default(),
+            obeys_timeout_hints: false,
         }
     }
 }
@@ -358,6 +363,11 @@ fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
         .subscription_poll_interval_ms(limits::POLL_MS)
         .max_session_timeout_ms(timeout)
         .limits(limits::server(config.clients));
+    if config.obeys_timeout_hints {
+        // The library cancels a request at this time or at the timeout of its caller, whichever is
+        // later.
+        builder = builder.max_timeout_ms(0);
+    }
     for security in &config.security {
         for (name, endpoint) in security.endpoints(config.endpoint.path()) {
             builder = builder.add_endpoint(name, endpoint);
