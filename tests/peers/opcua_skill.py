@@ -4,6 +4,7 @@ opcua_skill.py ENDPOINT walk       all states and methods of skill 1, which does
                                    then a run of skill 2, which ends
 opcua_skill.py ENDPOINT refused    responses of skill 3 to a Start without a parameter, with wrong
                                    parameters, and with good parameters
+opcua_skill.py ENDPOINT frame      skill 3 with its position as a 3DFrame: written, and by Execute
 opcua_skill.py ENDPOINT execute    Execute and ReadOutcome of skills 1 and 2, from two sessions, and
                                    the lock of OPC 10000-100
 opcua_skill.py ENDPOINT begin      starts skill 1, prints the number of the run and ends
@@ -63,6 +64,9 @@ class Skill:
     async def state(self):
         current = await self.child("CurrentState", "Id")
         return STATES[(await current.read_value()).Identifier]
+
+    async def is_in(self, state):
+        return await self.state() == state
 
     async def shown(self):
         values = [await self.state()]
@@ -185,6 +189,27 @@ async def refused(client, ns):
     await move.write("TargetPosition", double([0.3, 0.1, 0.4, 0.0, 0.0, 0.0]))
     say(what="good", status=await move.call("Start"), shown=await move.shown())
     say(what="while it runs", status=await move.write("MaxVelocity", double(1.0)), shown=await move.shown())
+
+
+def three_d_frame(x, y, z, a, b, c):
+    return ua.ThreeDFrame(ua.ThreeDCartesianCoordinates(x, y, z), ua.ThreeDOrientation(a, b, c))
+
+
+async def frame(client, ns):
+    move = Skill(client, ns, 3)
+    await move.call("Reset")
+    parameter = await move.child("ParameterSet", "TargetPosition")
+    written = await move.write("TargetPosition", three_d_frame(0.3, 0.1, 0.4, 0.0, 0.5, 0.0))
+    say(what="written", status=written, value=plain(await parameter.read_value()))
+    wrong = ua.Variant(ua.ThreeDCartesianCoordinates(0.3, 0.1, 0.4))
+    say(what="not a frame", status=await move.write("TargetPosition", wrong), value=plain(await parameter.read_value()))
+    status = await move.call("Start")
+    await until(lambda: move.is_in("Ready"))
+    say(what="started", status=status, value=(await move.result())["Position"])
+    target = ua.Variant([ua.Variant(three_d_frame(0.4, 0.0, 0.4, 0.0, 0.0, 0.0))], ua.VariantType.Variant, is_array=True)
+    status, _ = await asked(move, "Execute", names("TargetPosition"), target, timeout(0))
+    await until(lambda: move.is_in("Ready"))
+    say(what="executed", status=status, value=(await move.result())["Position"])
 
 
 async def asked(of, method, *arguments):
@@ -391,7 +416,7 @@ async def main():
             async with await client_of(args) as other:
                 await of_two[args.part](client, ns, other)
             return
-        await {"walk": walk, "refused": refused}[args.part](client, ns)
+        await {"walk": walk, "refused": refused, "frame": frame}[args.part](client, ns)
 
 
 asyncio.run(main())

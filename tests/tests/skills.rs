@@ -269,6 +269,33 @@ fn a_start_without_its_parameter_or_with_a_wrong_one_moves_nothing_and_says_whic
 }
 
 #[test]
+fn a_position_is_taken_as_a_frame_of_the_core_namespace_too() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _component = component(&cell.file("component.yaml", COMPONENT));
+    let lines = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "frame"]);
+    let told: Vec<(&Value, &Value, &Value)> = lines
+        .iter()
+        .map(|line| (&line["what"], &line["status"], &line["value"]))
+        .collect();
+    let (first, second) = (
+        json!([0.3, 0.1, 0.4, 0.0, 0.5, 0.0]),
+        json!([0.4, 0.0, 0.4, 0.0, 0.0, 0.0]),
+    );
+    let (good, bad) = (json!("Good"), json!("BadTypeMismatch"));
+    let whats = ["written", "not a frame", "started", "executed"].map(|what| json!(what));
+    let [written, not_a_frame, started, executed] = &whats;
+    let expected = [
+        (written, &good, &first),
+        (not_a_frame, &bad, &first),
+        (started, &good, &first),
+        (executed, &good, &second),
+    ];
+    assert_eq!(told, expected);
+}
+
+#[test]
 fn a_run_begun_in_one_call_is_told_of_by_its_number_to_another_session() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;

@@ -23,7 +23,7 @@ mod find;
 mod grip;
 mod handle;
 mod mirror;
-mod packed;
+pub(crate) mod packed;
 mod peers;
 mod remote;
 #[cfg(test)]

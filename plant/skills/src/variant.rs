@@ -2,6 +2,7 @@
 
 use plant_opcua::types::{Array, NodeId, UAString, Variant, VariantScalarTypeId};
 
+use crate::client::packed::frame;
 use crate::value::{Builtin, Value};
 
 /// Converts a value to a Variant.
@@ -75,7 +76,7 @@ pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(Strin
 }
 
 /// Converts a Variant to a value; `None` for other types, arrays of several dimensions and empty
-/// Variants.
+/// Variants. A 3DFrame becomes the six numbers of a position.
 #[expect(
     clippy::wildcard_enum_match_arm,
     reason = "of the types of OPC UA those that a skill can be told in are named"
@@ -111,6 +112,7 @@ pub fn from_variant(variant: &Variant) -> Option<Value> {
                 elements.filter(|all| all.iter().all(|one| one.shape().builtin == builtin))?;
             Value::Array(builtin, elements)
         }
+        Variant::ExtensionObject(_) => return frame(variant),
         _ => return None,
     })
 }
@@ -140,6 +142,10 @@ fn scalar_type(builtin: Builtin) -> VariantScalarTypeId {
 
 #[cfg(test)]
 mod tests {
+    use plant_opcua::types::{
+        ExtensionObject, Range, ThreeDCartesianCoordinates, ThreeDFrame, ThreeDOrientation,
+    };
+
     use super::*;
 
     #[test]
@@ -154,6 +160,27 @@ mod tests {
             assert_eq!(from_variant(&to_variant(&value)), Some(value));
         }
         assert_eq!(from_variant(&Variant::Empty), None);
+        let frame = ThreeDFrame {
+            cartesian_coordinates: ThreeDCartesianCoordinates {
+                x: 0.1,
+                y: 0.2,
+                z: 0.3,
+            },
+            orientation: ThreeDOrientation {
+                a: 1.0,
+                b: 2.0,
+                c: 3.0,
+            },
+        };
+        let frame = Variant::from(ExtensionObject::from_message(frame));
+        let six = Value::from([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
+        assert_eq!(from_variant(&frame), Some(six));
+        let range = Range {
+            low: 0.0,
+            high: 1.0,
+        };
+        let range = Variant::from(ExtensionObject::from_message(range));
+        assert_eq!(from_variant(&range), None, "it is no position");
         let mixed = Array {
             value_type: VariantScalarTypeId::Double,
             values: vec![Variant::Double(1.0), Variant::Int32(1)],

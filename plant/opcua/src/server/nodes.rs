@@ -44,6 +44,12 @@ pub trait WriteHandler: Send + Sync + 'static {
     /// # Errors
     /// Returns the status code of the refusal.
     async fn write(&self, request: WriteRequest) -> Result<(), StatusCode>;
+
+    /// Converts a value of another DataType that means the same into the DataType of the variable.
+    /// Other values are returned unchanged. The result is checked against the DataType.
+    fn converted(&self, value: Variant) -> Variant {
+        value
+    }
 }
 
 struct Function<F>(F);
@@ -218,11 +224,11 @@ impl Nodes {
         self.writers.write().remove(node);
     }
 
-    /// Returns the resulting value of a write if the variable may be written.
+    /// Returns the resulting value of a write of this value if the variable may be written.
     fn checked(
         context: &RequestContext,
         address_space: &AddressSpace,
-        write: &ParsedWriteValue,
+        (write, value): (&ParsedWriteValue, Option<Variant>),
     ) -> Result<DataValue, StatusCode> {
         let node = address_space
             .find(&write.node_id)
@@ -253,7 +259,7 @@ impl Nodes {
         {
             return Err(StatusCode::BadWriteNotSupported);
         }
-        let value = given.value.clone().ok_or(StatusCode::BadTypeMismatch)?;
+        let value = value.ok_or(StatusCode::BadTypeMismatch)?;
         let whole = if write.index_range.has_range() {
             let shown = super::value_of(variable);
             let mut whole = shown.value.ok_or(StatusCode::BadIndexRangeNoData)?;
@@ -377,7 +383,14 @@ impl InMemoryNodeManagerImpl for Nodes {
     ) -> Result<(), StatusCode> {
         let end = Instant::now() + LONGEST_REQUEST;
         for write in nodes {
-            let checked = Self::checked(context, &address_space.read(), write.value());
+            let node = write.value().node_id.clone();
+            let handler = self.writers.read().get(&node).cloned();
+            let given = write.value().value.value.clone();
+            let given = match &handler {
+                Some(handler) => given.map(|value| handler.converted(value)),
+                None => given,
+            };
+            let checked = Self::checked(context, &address_space.read(), (write.value(), given));
             let value = match checked {
                 Ok(value) => value,
                 Err(status) => {
@@ -385,8 +398,6 @@ impl InMemoryNodeManagerImpl for Nodes {
                     continue;
                 }
             };
-            let node = write.value().node_id.clone();
-            let handler = self.writers.read().get(&node).cloned();
             if let Some(handler) = handler {
                 let request = WriteRequest {
                     caller: self.sessions.caller(context),

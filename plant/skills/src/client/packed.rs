@@ -32,6 +32,15 @@ enum What {
     Range,
 }
 
+/// Returns the six numbers of a frame (3DFrame), or `None` for other values.
+pub(crate) fn frame(value: &Variant) -> Option<Value> {
+    let frame = Packed {
+        what: What::Frame,
+        many: false,
+    };
+    frame.unpack(value)
+}
+
 impl Packed {
     /// Returns the structure of a variable of this data type, if it is supported.
     pub(super) fn of(data_type: &NodeId, many: bool) -> Option<Self> {

@@ -5,32 +5,26 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use plant_opcua::server::{
-    MethodHandler, MethodRequest, Refusal as CallRefusal, Server, method, write,
+    MethodHandler, MethodRequest, Refusal as CallRefusal, Server, WriteHandler, WriteRequest, method,
 };
 use plant_opcua::types::{StatusCode, UAString, Variant};
 use program::Method;
 
 use super::show::{Nodes, texts};
 use crate::authority::Owner;
+use crate::client::packed::frame;
 use crate::refusal::Refusal;
 use crate::skill::Skill;
-use crate::variant::{from_pairs, from_variant, to_pairs};
+use crate::variant::{from_pairs, from_variant, to_pairs, to_variant};
 
 /// Registers the handlers for writes of parameters and calls of methods.
 pub(super) fn serve(server: &Server, nodes: &Nodes, skill: &Skill) {
     for (name, node) in nodes.parameters() {
-        let (skill, name) = (skill.clone(), name.to_owned());
-        server.on_write(
-            node,
-            write(move |request| {
-                let value = request.value.value.as_ref().and_then(from_variant);
-                let value = value.ok_or(StatusCode::BadTypeMismatch)?;
-                let by = Owner::Session(request.caller.session);
-                skill
-                    .write(&by, &name, value)
-                    .map_err(|refusal| status(&refusal))
-            }),
-        );
+        let handler = Given {
+            skill: skill.clone(),
+            name: name.to_owned(),
+        };
+        server.on_write(node, Arc::new(handler));
     }
     for method in Method::ALL {
         if let Some(node) = nodes.method(method) {
@@ -51,6 +45,28 @@ pub(super) fn serve(server: &Server, nodes: &Nodes, skill: &Skill) {
         let skill = skill.clone();
         let handler = method(move |request| read_outcome(&skill, &request));
         server.on_call(nodes.skill(), node, handler);
+    }
+}
+
+/// Takes the values that clients write to a parameter.
+struct Given {
+    skill: Skill,
+    name: String,
+}
+
+#[async_trait]
+impl WriteHandler for Given {
+    async fn write(&self, request: WriteRequest) -> Result<(), StatusCode> {
+        let value = request.value.value.as_ref().and_then(from_variant);
+        let value = value.ok_or(StatusCode::BadTypeMismatch)?;
+        let by = Owner::Session(request.caller.session);
+        let written = self.skill.write(&by, &self.name, value);
+        written.map_err(|refusal| status(&refusal))
+    }
+
+    /// A 3DFrame is the six numbers of a position.
+    fn converted(&self, value: Variant) -> Variant {
+        frame(&value).map_or(value, |six| to_variant(&six))
     }
 }
 
