@@ -214,7 +214,7 @@ fn starting_files_are_accepted_by_their_programs() {
         let (code, lines) = run("ua-space", &["new", kind, "-o", path]);
         assert_eq!(code, 74, "an existing file is kept: {lines:?}");
     }
-    for driver in ["ros", "exec", "http"] {
+    for driver in ["ros", "moveit", "exec", "http"] {
         let path = cell.folder().join(format!("{driver}.yaml"));
         let path = path.to_str().unwrap();
         let new = ["new", "component", "--driver", driver, "-o", path];

@@ -50,6 +50,9 @@ const fn text(template: Template, driver: DriverTemplate) -> &'static str {
         (Template::Component, DriverTemplate::Ros) => include_str!("new/component-ros.yaml"),
         (Template::Component, DriverTemplate::Exec) => include_str!("new/component-exec.yaml"),
         (Template::Component, DriverTemplate::Http) => include_str!("new/component-http.yaml"),
+        (Template::Component, DriverTemplate::Moveit) => {
+            include_str!("new/component-moveit.yaml")
+        }
         (Template::Mes, _) => include_str!("new/mes.yaml"),
         (Template::Mapping, _) => include_str!("new/mapping.yaml"),
         (Template::Sysml, _) => include_str!("new/ua-bridge.sysml"),

@@ -64,6 +64,8 @@ pub(crate) enum DriverTemplate {
     Simulated,
     /// An action or a service of ROS
     Ros,
+    /// An arm with MoveIt 2, of any maker
+    Moveit,
     /// A program of your own
     Exec,
     /// The HTTP interface of a device
