@@ -1,7 +1,8 @@
 """Reads robots like a client of OPC 40010-1, which does not know skills, and prints JSON lines.
 
 It reads each motion device system of the DeviceSet, then each value of its first task control while
-skill 1 of the server's own namespace runs once.
+skill 1 of the server's own namespace runs once. With `--values` it reads the axes, the speed override
+and the safety states of the first system instead, and ends.
 """
 
 import argparse
@@ -51,6 +52,23 @@ async def only(node, folder):
     return name, found[name], kind.Identifier
 
 
+async def measured(system):
+    """Returns the axes, the speed override and the safety states of a system."""
+    _, arm, _ = await only(system, "MotionDevices")
+    children = await names(arm)
+    axes = []
+    for name, axis in (await names(children["Axes"])).items():
+        below = await names(axis)
+        position = (await names(below["ParameterSet"]))["ActualPosition"]
+        unit = await (await names(position))["EngineeringUnits"].read_value()
+        axes.append([name, await value(position), unit.DisplayName.Text, await value(below["MotionProfile"])])
+    safety = {}
+    for name, state in (await names((await names(system))["SafetyStates"])).items():
+        wanted = ["EmergencyStop", "ProtectiveStop", "OperationalMode"]
+        safety[name] = await values((await names(state))["ParameterSet"], *wanted)
+    return {"axes": axes, "speed": await value((await names(children["ParameterSet"]))["SpeedOverride"]), "safety": safety}
+
+
 async def run(args):
     async with await opcua_session.client_of(args) as client:
         lifetime.say(ready=args.endpoint)
@@ -59,6 +77,9 @@ async def run(args):
         for system in await device_set.get_children():
             if await system.read_type_definition() != ua.NodeId(1002, robotics):
                 continue
+            if args.values:
+                lifetime.say(**await measured(system))
+                return
             plate = ["Manufacturer", "Model", "ProductCode", "SerialNumber"]
             arm_name, arm, arm_type = await only(system, "MotionDevices")
             _, controller, controller_type = await only(system, "Controllers")
@@ -89,6 +110,7 @@ async def run(args):
 def main():
     parser = argparse.ArgumentParser()
     opcua_session.add_arguments(parser)
+    parser.add_argument("--values", action="store_true")
     args = parser.parse_args()
     lifetime.bound(args.limit)
     asyncio.run(run(args))

@@ -93,6 +93,8 @@ pub struct Robot {
     pub serial_number: String,
     /// A value of MotionDeviceCategoryEnumeration (OPC 40010-1, 7.2.3).
     pub category: i32,
+    /// The number of axes that are shown with the value `JointPositions`.
+    pub axes: usize,
     /// The location in the document.
     pub place: Place,
 }

@@ -210,7 +210,8 @@ impl ComponentServer {
         uses::show(&server, &root.node_id, &used, &mut ids)?;
         tasks.spawn(Lock::serve(&server, &authority, &root.node_id, &mut ids)?);
         if let Some(robot) = &component.robot {
-            let kept = robot::serve(&server, (&component.name, robot), &skills, &mut ids)?;
+            let of = (skills.as_slice(), values.live.as_slice());
+            let kept = robot::serve(&server, (&component.name, robot), of, &mut ids)?;
             tasks.spawn(kept);
         }
         tasks.spawn(shown);

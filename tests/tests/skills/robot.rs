@@ -1,7 +1,7 @@
 //! A robot for clients of OPC 40010-1, which know no skills.
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Peer, eventually};
+use system_tests::{Cell, Peer, Started, eventually, program};
 
 use super::{ENDPOINT, SOON, component};
 
@@ -61,6 +61,53 @@ fn a_client_that_knows_robots_and_no_skills_sees_what_it_is_and_which_program_ru
             (json!(told) == expected).then_some(())
         });
     }
+}
+
+/// A UR with all its values, behind its simulator.
+const MEASURED: &str = "component: arm
+application_uri: urn:ua-bridge:system-tests:component
+namespace: 6
+security: [None]
+robot: {manufacturer: Universal Robots, model: UR5, category: articulated_robot}
+device: {universal_robot: {host: 127.0.0.1}}
+values: [{device: all}]
+skills:
+  - {name: PtpMove, type: PtpMoveSkillType, driver: device}
+";
+
+#[test]
+fn a_client_that_knows_robots_sees_the_axes_the_speed_and_the_safety_state_of_a_ur() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    // NodeSets of the OPC Foundation.
+    let files = ["Robotics", "Di"].map(|name| format!("nodesets/Opc.Ua.{name}.NodeSet2.xml"));
+    let [Some(robotics), Some(di)] = files.map(|file| test_data::foreign(&file)) else {
+        return;
+    };
+    let _simulator = Started::new("universal-robot", &program("ua-component"))
+        .args(["simulate", "universal-robot"])
+        .start();
+    eventually("the simulator serves", SOON, || {
+        std::net::TcpStream::connect("127.0.0.1:30004").ok()
+    });
+    let nodesets = format!("nodesets: ['{}', '{}']\n", robotics.display(), di.display());
+    let yaml = cell.file("arm.yaml", &format!("{nodesets}{MEASURED}"));
+    let _arm = component(&yaml);
+    let seen = eventually("the values of the robot are shown", SOON, || {
+        let lines = cell.asyncua_try("opcua_robot.py", &[ENDPOINT, "--values"])?;
+        let seen = lines.iter().find(|line| line.get("axes").is_some())?.clone();
+        let is_measured = seen["speed"].is_number() && seen["axes"][0][1].is_number();
+        is_measured.then_some(seen)
+    });
+    let axis = |number: usize| json!([format!("Axis_{number}"), 0.0, "rad", 1]);
+    let axes: Vec<Value> = (1..=6).map(axis).collect();
+    let expected = json!({
+        "axes": axes,
+        "speed": 100.0,
+        "safety": {"SafetyState": {"EmergencyStop": false, "ProtectiveStop": false, "OperationalMode": 0}},
+    });
+    assert_eq!(seen, expected);
 }
 
 #[test]

@@ -342,8 +342,9 @@ fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
         "product_code",
         "serial_number",
         "category",
+        "axes",
     ];
-    let [manufacturer, model, code, number, category] = reader.map(node, keys)?;
+    let [manufacturer, model, code, number, category, axes] = reader.map(node, keys)?;
     let manufacturer = reader.needed(manufacturer, "manufacturer", node.place);
     let model = reader.needed(model, "model", node.place);
     let mut line = |node: Option<&Node>| {
@@ -365,13 +366,25 @@ fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
     };
     let (product_code, serial_number) = (line_or_none(code), line_or_none(number));
     let category = category.map_or(Some(0), |node| read_category(node, reader));
+    let axes = axes.map_or(Some(USUAL_AXES), |node| read_axes(node, reader));
     Some(Robot {
         manufacturer: manufacturer?,
         model: model?,
         product_code: product_code?,
         serial_number: serial_number?,
         category: category?,
+        axes: axes?,
         place: node.place,
+    })
+}
+
+fn read_axes(node: &Node, reader: &mut Reader<'_>) -> Option<usize> {
+    let text = reader.text(node, "a number of axes")?;
+    let axes = text.parse().ok().filter(|axes| (1..=MOST_AXES).contains(axes));
+    axes.or_else(|| {
+        let text = shortened(text);
+        let message = format!("expected a number from 1 to {MOST_AXES}, found `{text}`");
+        reader.refuse(node, Code::WrongValue, message)
     })
 }
 
@@ -729,6 +742,8 @@ const USUALLY_WITHIN: Duration = Duration::from_secs(60);
 /// Default time from Halt until a program is killed.
 const USUAL_HALT: Duration = Duration::from_secs(5);
 const LONGEST_NAME: usize = 64;
+const USUAL_AXES: usize = 6;
+const MOST_AXES: usize = 32;
 const LONGEST_PASSWORD_FILE: u64 = 4096;
 /// MotionDeviceCategoryEnumeration (OPC 40010-1, 7.2.3), by its values.
 const CATEGORIES: [&str; 7] = [

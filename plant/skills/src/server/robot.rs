@@ -1,12 +1,14 @@
 //! A robot as defined by OPC 40010-1, beside its skills: the running skill is the program of its
 //! only task control.
 //!
-//! Drivers have no data about axes, power trains and safety states, so these are not shown.
-//! `SpeedOverride` has a Bad status.
+//! The axes, the speed override and the safety state are shown from the values of the component
+//! (`measured`). Power trains and loads are not shown: drivers have no data about them.
+
+mod measured;
 
 use std::future::Future;
 
-use futures_util::future::select_all;
+use futures_util::future::{join_all, select_all};
 use plant_opcua::server::{IdRange, Instance, InstanceError, InstanceSpec, Server};
 use plant_opcua::types::{DataValue, LocalizedText, NodeId, QualifiedName, StatusCode, Variant};
 use program::State;
@@ -14,6 +16,7 @@ use program::State;
 use crate::component::Robot;
 use crate::model::DEVICES;
 use crate::skill::Skill;
+use crate::values::LiveValue;
 use crate::yaml::{Code, Finding};
 
 /// Returns a finding if there is a robot and the types of OPC 40010-1 are missing.
@@ -28,11 +31,11 @@ pub(super) fn lacks_types(server: &Server, robot: Option<&Robot>) -> Option<Find
 }
 
 /// Creates the motion device system in the DeviceSet of OPC 10000-100. The returned future updates
-/// its task control.
+/// its task control, and the nodes with values of the component.
 pub(super) fn serve(
     server: &Server,
     (name, robot): (&str, &Robot),
-    skills: &[Skill],
+    (skills, values): (&[Skill], &[LiveValue]),
     ids: &mut IdRange,
 ) -> Result<impl Future<Output = ()> + use<>, InstanceError> {
     let mut maker = Maker { server, ids };
@@ -60,11 +63,17 @@ pub(super) fn serve(
         show_plate(server, device, robot);
     }
     show(server, &arm, "MotionDeviceCategory", robot.category);
-    // Drivers do not report a speed limit, and the controller has no users.
-    for (of, path) in [
-        (&arm, "ParameterSet/SpeedOverride"),
-        (&controller, "CurrentUser/Level"),
-    ] {
+    let axes = measured::axes(&mut maker, &arm, (values, robot.axes))?;
+    let safety = measured::safety(&mut maker, &system, values)?;
+    let speed = measured::speed(server, &arm, values);
+    // The controller has no users.
+    let speed_is_unknown = speed
+        .is_none()
+        .then_some((&arm, "ParameterSet/SpeedOverride"));
+    for (of, path) in [Some((&controller, "CurrentUser/Level")), speed_is_unknown]
+        .into_iter()
+        .flatten()
+    {
         let unknown = DataValue {
             status: Some(StatusCode::BadNotSupported),
             ..DataValue::null()
@@ -75,7 +84,11 @@ pub(super) fn serve(
     }
     show(server, &task, "ComponentName", LocalizedText::from(name));
     show(server, &task, "ParameterSet/ExecutionMode", CYCLE);
-    Ok(keep(server.clone(), task, skills.to_vec()))
+    let task = keep(server.clone(), task, skills.to_vec());
+    let measured = [axes, safety, speed].into_iter().flatten();
+    Ok(async move {
+        tokio::join!(task, join_all(measured));
+    })
 }
 
 /// Shows the nameplate of a device.
