@@ -1,6 +1,7 @@
 //! `cargo xtask bench skills`: the delays of a client, the duration of a skill's methods compared
-//! with a plain method, and many skills in a server.
+//! with a plain method, many skills in a server, and many devices below a station.
 
+mod crowd;
 mod finding;
 
 use std::process::ExitCode;
@@ -21,10 +22,12 @@ fn main() -> ExitCode {
         }
     };
     let is_finding = args.first().is_some_and(|arg| arg == "finding");
-    let (Some(runs), Some(skills), Some(servers)) = (
+    let is_station = args.first().is_some_and(|arg| arg == "station");
+    let (Some(runs), Some(skills), Some(servers), Some(devices)) = (
         number("--runs", if is_finding { 20 } else { 200 }),
-        number("--skills", 1_000),
+        number("--skills", if is_station { 20 } else { 1_000 }),
         number("--servers", 500),
+        number("--devices", 100),
     ) else {
         print!("{HELP}");
         return ExitCode::from(64);
@@ -33,11 +36,13 @@ fn main() -> ExitCode {
         print!("{HELP}");
         return ExitCode::SUCCESS;
     }
-    if is_finding {
-        return match finding::all(runs, servers) {
-            Some(()) => ExitCode::SUCCESS,
-            None => ExitCode::FAILURE,
-        };
+    let measured = match (is_finding, is_station) {
+        (true, _) => Some(finding::all(runs, servers)),
+        (false, true) => Some(crowd::all(devices, skills, runs)),
+        (false, false) => None,
+    };
+    if let Some(measured) = measured {
+        return measured.map_or(ExitCode::FAILURE, |()| ExitCode::SUCCESS);
     }
     let Some(cell) = Cell::with(&[]) else {
         return ExitCode::FAILURE;
@@ -59,10 +64,12 @@ fn main() -> ExitCode {
 const HELP: &str = "\
 cargo xtask bench skills [--runs N] [--skills N]
 cargo xtask bench skills finding [--runs N] [--servers N]
+cargo xtask bench skills station [--devices N] [--skills N] [--runs N]
 
   --runs N     runs and calls of each kind (200); servers that are plugged in (20)
-  --skills N   skills in one server (1000)
+  --skills N   skills in one server (1000), or in each device (20)
   --servers N  servers that register with one discovery server (500)
+  --devices N  devices below one station (100)
 ";
 
 /// Starts a component with this number of grippers that complete their actions at once.
