@@ -45,6 +45,10 @@ impl Cell {
         here.join("near", &middle, HERE);
         there.join("far", &middle, THERE);
         there.ip(&["route", "add", "224.0.0.0/4", "dev", WIRE]);
+        for host in [&here, &there] {
+            // A segment is not longer than a frame.
+            host.ip(&["link", "set", WIRE, "gso_max_segs", "1"]);
+        }
         for end in ["near", "far"] {
             middle.ip(&["link", "set", end, "mtu", "1500", "up"]);
         }

@@ -101,7 +101,7 @@ impl Direction {
         self.random ^= self.random << 17;
         let chance = (self.random >> 11) as f64 / (1_u64 << 53) as f64;
         if chance >= self.wire.loss {
-            forget_checksum(frame);
+            finish_checksum(frame);
             self.under_way
                 .push_back((Instant::now() + self.wire.delay, frame.to_vec()));
         }
@@ -123,22 +123,61 @@ impl Direction {
     }
 }
 
-/// Clears the checksum of a UDP datagram over IPv4, where it is optional. The sender's kernel
-/// leaves the checksum to the network card, which a pair of veth does not have.
-fn forget_checksum(frame: &mut [u8]) {
-    const ETHERNET: usize = 14;
-    let udp_over_ipv4 = frame.len() > ETHERNET + 20
+/// Completes the checksum of a UDP datagram or TCP segment over IPv4. The sender's kernel leaves it to
+/// the network card, which a pair of veth does not have. For UDP it is optional, and cleared.
+fn finish_checksum(frame: &mut [u8]) {
+    let is_ipv4 = frame.len() > ETHERNET + 20
         && frame[12..14] == [0x08, 0x00]
-        && frame[ETHERNET + 9] == 17
-        // Only the first fragment has the UDP header.
+        // Only the first fragment has the header.
         && u16::from_be_bytes([frame[ETHERNET + 6], frame[ETHERNET + 7]]) & 0x1fff == 0;
-    if udp_over_ipv4 {
-        let header = ETHERNET + usize::from(frame[ETHERNET] & 0x0f) * 4;
-        if let Some(checksum) = frame.get_mut(header + 6..header + 8) {
-            checksum.fill(0);
+    if !is_ipv4 {
+        return;
+    }
+    let header = ETHERNET + usize::from(frame[ETHERNET] & 0x0f) * 4;
+    match frame[ETHERNET + 9] {
+        UDP => {
+            if let Some(checksum) = frame.get_mut(header + 6..header + 8) {
+                checksum.fill(0);
+            }
         }
+        TCP => {
+            let total = usize::from(u16::from_be_bytes([
+                frame[ETHERNET + 2],
+                frame[ETHERNET + 3],
+            ]));
+            // A short frame has padding behind the packet.
+            let end = (ETHERNET + total).min(frame.len());
+            if header + 20 > end {
+                return;
+            }
+            frame[header + 16..header + 18].fill(0);
+            let length = u16::try_from(end - header).unwrap();
+            let addresses = &frame[ETHERNET + 12..ETHERNET + 20];
+            let sum = sum_of(addresses) + u32::from(TCP) + u32::from(length);
+            let sum = sum + sum_of(&frame[header..end]);
+            let folded = (sum & 0xffff) + (sum >> 16);
+            let folded = (folded & 0xffff) + (folded >> 16);
+            let checksum = !u16::try_from(folded).unwrap();
+            frame[header + 16..header + 18].copy_from_slice(&checksum.to_be_bytes());
+        }
+        _ => {}
     }
 }
+
+/// Returns the sum of the 16-bit words (RFC 1071) of at most 64 KiB.
+fn sum_of(bytes: &[u8]) -> u32 {
+    let words = bytes.chunks(2).map(|word| {
+        let low = word.get(1).copied().unwrap_or(0);
+        u32::from(u16::from_be_bytes([word[0], low]))
+    });
+    words.sum()
+}
+
+/// Length of the header of a frame.
+const ETHERNET: usize = 14;
+/// Protocol numbers of IPv4.
+const UDP: u8 = 17;
+const TCP: u8 = 6;
 
 /// Opens a socket that receives all frames of the interface and sends frames through it.
 fn packet_socket(interface: &str) -> OwnedFd {
@@ -194,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_checksum_of_a_datagram_is_forgotten() {
+    fn only_the_checksum_of_a_datagram_is_cleared() {
         let mut frame = vec![0xff; 60];
         frame[12..14].copy_from_slice(&[0x08, 0x00]);
         frame[14] = 0x45;
@@ -202,14 +241,32 @@ mod tests {
         frame[23] = 17;
         let mut expected = frame.clone();
         expected[40..42].copy_from_slice(&[0, 0]);
-        forget_checksum(&mut frame);
+        finish_checksum(&mut frame);
         assert_eq!(frame, expected);
 
         // A later fragment has data at this position.
         frame[20..22].copy_from_slice(&[0x20, 0xb9]);
         frame[40..42].copy_from_slice(&[7, 7]);
         let later = frame.clone();
-        forget_checksum(&mut frame);
+        finish_checksum(&mut frame);
         assert_eq!(frame, later);
+    }
+
+    #[test]
+    fn the_checksum_of_a_segment_is_that_of_the_standard() {
+        // A segment of RFC 9293 without data, from 10.77.0.1:4840 to 10.77.0.2:50000.
+        let mut frame = vec![0; ETHERNET];
+        frame[12..14].copy_from_slice(&[0x08, 0x00]);
+        let ip = [0x45, 0, 0, 40, 0, 0, 0x40, 0, 64, TCP, 0, 0, 10, 77, 0, 1, 10, 77, 0, 2];
+        frame.extend(ip);
+        let tcp = [0x12, 0xe8, 0xc3, 0x50, 0, 0, 0, 1, 0, 0, 0, 2, 0x50, 0x10, 1, 0, 0xde, 0xad, 0, 0];
+        frame.extend(tcp);
+        // Padding does not count.
+        frame.extend([0xff; 6]);
+        finish_checksum(&mut frame);
+        let segment = &frame[ETHERNET + 20..ETHERNET + 40];
+        let sum = sum_of(&ip[12..20]) + u32::from(TCP) + 20 + sum_of(segment);
+        assert_eq!((sum & 0xffff) + (sum >> 16), 0xffff, "{segment:02x?}");
+        assert_ne!(segment[16..18], [0xde, 0xad]);
     }
 }

@@ -96,7 +96,10 @@ fn a_client_that_knows_robots_sees_the_axes_the_speed_and_the_safety_state_of_a_
     let _arm = component(&yaml);
     let seen = eventually("the values of the robot are shown", SOON, || {
         let lines = cell.asyncua_try("opcua_robot.py", &[ENDPOINT, "--values"])?;
-        let seen = lines.iter().find(|line| line.get("axes").is_some())?.clone();
+        let seen = lines
+            .iter()
+            .find(|line| line.get("axes").is_some())?
+            .clone();
         let is_measured = seen["speed"].is_number() && seen["axes"][0][1].is_number();
         is_measured.then_some(seen)
     });

@@ -1,15 +1,16 @@
-//! Skills over worse networks: a link that is interrupted during a run.
+//! Skills over worse networks: a link that is interrupted during a run, and one that loses and delays
+//! frames.
 
 use std::time::Duration;
 
 use skills::{ClientOptions, SkillClient, SkillHandle, TypeName};
-use system_tests::{Cable, Cell, Child, HERE, Started, THERE, WIRE, program};
+use system_tests::{Cell, HERE, Started, THERE, WIRE, Wire, program};
 use tokio::time::{Instant, sleep};
 
 use super::SOON;
 
-/// A component at the other end of a cable.
-fn there(cell: &Cell, cable: &Cable) -> Child {
+/// A component for the other end of a cable or wire.
+fn far(cell: &Cell) -> Started {
     let yaml = "{component: far, application_uri: 'urn:ua-bridge:system-tests:far', namespace: 9,
         security: [None], skills: [
           {name: Grasp, type: GraspSkillType, driver: {simulated: {duration: 5 s}}},
@@ -25,8 +26,6 @@ fn there(cell: &Cell, cable: &Cable) -> Child {
             "--interface",
             WIRE,
         ])
-        .beyond(cable)
-        .start()
 }
 
 /// Connects to the component with a time limit for each response.
@@ -63,7 +62,7 @@ fn a_run_goes_on_while_the_link_is_gone_and_its_outcome_is_read_afterwards() {
     let Some(cell) = Cell::with(&[]) else { return };
     let cable = cell.cable();
     cable.lay(HERE);
-    let _component = there(&cell, &cable);
+    let _component = far(&cell).beyond(&cable).start();
     on_this_host(async || {
         // A caller that waits for its run by number gets the outcome after the link is back.
         let client = connected(Duration::from_secs(2)).await;
@@ -77,6 +76,32 @@ fn a_run_goes_on_while_the_link_is_gone_and_its_outcome_is_read_afterwards() {
         let (outcome, ()) = tokio::join!(grasp.wait(run, SOON), gone);
         let outcome = outcome.unwrap();
         assert_eq!((outcome.run, outcome.succeeded), (run, true), "{outcome:?}");
+        client.close().await;
+    });
+}
+
+#[test]
+fn runs_over_a_lossy_and_slow_link_happen_once_each_and_their_outcomes_are_known() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let host = cell.host(Wire {
+        loss: 0.05,
+        delay: Duration::from_millis(50),
+    });
+    let _component = far(&cell).on(&host).start();
+    on_this_host(async || {
+        // A lost frame is sent again after 200 ms and more.
+        let client = connected(Duration::from_secs(10)).await;
+        let release = one(&client, "ReleaseSkillType").await;
+        let mut before = None;
+        for _ in 0..20 {
+            let outcome = skills::Runs::run(&release, Vec::new(), SOON).await.unwrap();
+            assert!(outcome.succeeded, "{outcome:?}");
+            assert!(
+                before.is_none_or(|before| outcome.run == before + 1),
+                "a Start took effect twice, or a run is missing: {before:?} {outcome:?}"
+            );
+            before = Some(outcome.run);
+        }
         client.close().await;
     });
 }

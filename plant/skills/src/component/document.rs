@@ -380,7 +380,10 @@ fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
 
 fn read_axes(node: &Node, reader: &mut Reader<'_>) -> Option<usize> {
     let text = reader.text(node, "a number of axes")?;
-    let axes = text.parse().ok().filter(|axes| (1..=MOST_AXES).contains(axes));
+    let axes = text
+        .parse()
+        .ok()
+        .filter(|axes| (1..=MOST_AXES).contains(axes));
     axes.or_else(|| {
         let text = shortened(text);
         let message = format!("expected a number from 1 to {MOST_AXES}, found `{text}`");

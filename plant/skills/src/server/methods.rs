@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use plant_opcua::server::{
-    MethodHandler, MethodRequest, Refusal as CallRefusal, Server, WriteHandler, WriteRequest, method,
+    MethodHandler, MethodRequest, Refusal as CallRefusal, Server, WriteHandler, WriteRequest,
+    method,
 };
 use plant_opcua::types::{StatusCode, UAString, Variant};
 use program::Method;

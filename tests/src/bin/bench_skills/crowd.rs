@@ -3,7 +3,9 @@
 use std::time::{Duration, Instant};
 
 use skills::{ClientOptions, Runs as _, SkillClient, TypeName};
-use system_tests::{Cell, Child, Site, Started, Times, cpu_share, eventually, metrics, program, resident};
+use system_tests::{
+    Cell, Child, Site, Started, Times, cpu_share, eventually, metrics, program, resident,
+};
 
 /// Measures the time until the skills of all devices are seen above the station, the duration of
 /// runs through the station, and the resources of the station when idle.
@@ -50,10 +52,21 @@ pub(crate) fn all(devices: usize, skills: usize, runs: usize) -> Option<()> {
 }
 
 fn station(at: &Site) -> Child {
-    let levels = ["--endpoint", "opc.tcp://10.80.1.1:4840", "--interface", "lower0"];
+    let levels = [
+        "--endpoint",
+        "opc.tcp://10.80.1.1:4840",
+        "--interface",
+        "lower0",
+    ];
     let upper = ["--upper-interface", "upper0", "--upper-endpoint", UPPER];
     Started::new("station", &program("ua-station"))
-        .args(["--name", "station", "--allow-unsecured", "--metrics", STATUS])
+        .args([
+            "--name",
+            "station",
+            "--allow-unsecured",
+            "--metrics",
+            STATUS,
+        ])
         .args(levels)
         .args(upper)
         .at(at)
@@ -87,7 +100,11 @@ fn seen(skills: usize) -> Option<usize> {
     let below = status["level"]["below"].as_array()?;
     let methods = below.iter().map(|one| one["server"]["methods"].as_u64());
     let least = u64::try_from(5 * skills).unwrap();
-    Some(methods.filter(|methods| methods.is_some_and(|methods| methods >= least)).count())
+    Some(
+        methods
+            .filter(|methods| methods.is_some_and(|methods| methods >= least))
+            .count(),
+    )
 }
 
 /// Lists the skills as a client above the station, and runs the first. Returns the time to list
