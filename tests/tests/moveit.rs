@@ -114,4 +114,23 @@ fn an_arm_with_moveit_is_moved_by_skills() {
     });
     assert_eq!(met["joints"][0], json!(["joint_1", 0.5, 1.0]), "{met}");
     assert_eq!(met["joints"][5], json!(["joint_6", -0.5, 1.0]), "{met}");
+
+    reset("ToRest");
+    executes_a_trajectory(&mut group);
+}
+
+/// Checks that a trajectory that was planned before is executed as the component has it.
+fn executes_a_trajectory(group: &mut Child) {
+    let (code, done) = ended(ask(&["arm.ToRest"]));
+    assert_eq!((code, &done["succeeded"]), (0, &json!(true)), "{done}");
+    let met = group.wait_for_json("the trajectory", SOON, |line| {
+        line.get("trajectory").map(|_| line.clone())
+    });
+    let names: Vec<String> = (1..=6).map(|joint| format!("joint_{joint}")).collect();
+    assert_eq!(met["names"], json!(names), "{met}");
+    let points = met["trajectory"].as_array().unwrap();
+    let times: Vec<&Value> = points.iter().map(|point| &point[1]).collect();
+    assert_eq!(times, [0, 2, 5], "{met}");
+    let last = json!([[0.0, -2.1, 2.1, -1.57, -1.57, 0.0], 5]);
+    assert_eq!(points.last(), Some(&last), "{met}");
 }

@@ -1,5 +1,6 @@
-"""Runs a Cyclone DDS server of `moveit_msgs/MoveGroup`, as rmw_cyclonedds and rcl_action do, with
-the definitions of tests/data/moveit. Nothing is planned.
+"""Runs Cyclone DDS servers of `moveit_msgs/MoveGroup` and of `moveit_msgs/ExecuteTrajectory` (at
+/execute_trajectory), as rmw_cyclonedds and rcl_action do, with the definitions of tests/data/moveit.
+Nothing is planned.
 
 The x of a goal's position, or the position of its first joint, selects the reaction: -1 is
 rejected, -2 fails in planning (aborted, PLANNING_FAILED), -4 is preempted by another client
@@ -85,6 +86,17 @@ Options = types.struct(
 )
 Code = types.struct("moveit_msgs/msg/MoveItErrorCodes", [("val", int32, 0)])
 
+TrajectoryPoint = types.struct(
+    "trajectory_msgs/msg/JointTrajectoryPoint",
+    [(name, sequence[float64], list) for name in ("positions", "velocities", "accelerations", "effort")]
+    + [("time_from_start", Time, Time)],
+)
+JointTrajectory = types.struct(
+    "trajectory_msgs/msg/JointTrajectory",
+    [("header", Header, Header), ("joint_names", sequence[str], list), ("points", sequence[TrajectoryPoint], list)],
+)
+Trajectory = types.struct("moveit_msgs/msg/RobotTrajectory", [("joint_trajectory", JointTrajectory, JointTrajectory)])
+
 ID = [("goal_id", types.UUID, types.UUID)]
 NAME = "moveit_msgs/action/MoveGroup"
 SEND = types.service(
@@ -94,6 +106,15 @@ SEND = types.service(
 )
 RESULT = types.service(f"{NAME}_GetResult", ID, [("status", int8, 0), ("error_code", Code, Code)])
 Feedback = types.struct(f"{NAME}_FeedbackMessage", ID + [("state", str, "")])
+
+EXECUTE = "moveit_msgs/action/ExecuteTrajectory"
+SEND_TRAJECTORY = types.service(
+    f"{EXECUTE}_SendGoal",
+    ID + [("trajectory", Trajectory, Trajectory), ("controller_names", sequence[str], list)],
+    [("accepted", bool, False), ("stamp", Time, Time)],
+)
+TRAJECTORY_RESULT = types.service(f"{EXECUTE}_GetResult", ID, [("status", int8, 0), ("error_code", Code, Code)])
+TrajectoryFeedback = types.struct(f"{EXECUTE}_FeedbackMessage", ID + [("state", str, "")])
 
 SUCCESS, PLANNING_FAILED, INVALID_MOTION_PLAN, PREEMPTED = 1, -1, -2, -7
 
@@ -139,7 +160,7 @@ class MoveGroup(ros2_action.ActionServer):
 
     def step(self, goal):
         goal.sequence.append(1)
-        self.feedback.write(Feedback(goal_id=goal.id, state="PLANNING"))
+        self.feedback.write(self.KINDS[2](goal_id=goal.id, state="PLANNING"))
 
     def work(self, goal):
         if goal.order == -4 and goal.status < ros2_action.SUCCEEDED:
@@ -155,6 +176,19 @@ class MoveGroup(ros2_action.ActionServer):
         self.result.answer(request, self.result.kind(status=goal.status, error_code=Code(val=code)))
 
 
+class ExecuteTrajectory(MoveGroup):
+    """Executes a trajectory: the last position of its first joint selects the reaction."""
+
+    KINDS = (SEND_TRAJECTORY, TRAJECTORY_RESULT, TrajectoryFeedback)
+
+    def goal(self, request):
+        trajectory = request.trajectory.joint_trajectory
+        request.order = int(trajectory.points[-1].positions[0])
+        points = [[list(point.positions), point.time_from_start.sec] for point in trajectory.points]
+        lifetime.say(trajectory=points, names=list(trajectory.joint_names))
+        ros2_action.ActionServer.goal(self, request)
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("action")
@@ -164,10 +198,13 @@ def main():
     parser.add_argument("--limit", type=float, default=200.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)
-    server = MoveGroup(DomainParticipant(args.domain), args)
+    participant = DomainParticipant(args.domain)
+    of_trajectories = argparse.Namespace(**{**vars(args), "action": "/execute_trajectory"})
+    servers = [MoveGroup(participant, args), ExecuteTrajectory(participant, of_trajectories)]
     lifetime.say(ready=args.action)
     while True:
-        server.turn()
+        for server in servers:
+            server.turn()
         time.sleep(0.002)
 
 
