@@ -429,10 +429,7 @@ impl Session {
                 return Ok(at);
             }
             if let Err(why) = at.fit() {
-                return Err(match at.started == token {
-                    true => self.unfit((motion, work), &why).await,
-                    false => self.withdraw((motion, work), sent, &why).await?,
-                });
+                return Err(self.unfit((motion, work), sent, (&at, &why)).await?);
             }
             if let Some(guard) = guard
                 && guard.exceeded(at.force, at.pose)
@@ -476,18 +473,29 @@ impl Session {
     /// Ends the run of a robot that stands by itself, as in a protective stop. Such a stop pauses the
     /// program, which goes on when the robot is released: then the outcome is unknown. Returns the
     /// reason.
-    async fn unfit(&mut self, (motion, work): (&Motion, &Work), why: &str) -> String {
+    ///
+    /// # Errors
+    /// The robot may go on, or start later: the outcome is unknown.
+    async fn unfit(
+        &mut self,
+        (motion, work): (&Motion, &Work),
+        sent: &mut Sent,
+        (at, why): (&State, &str),
+    ) -> Result<String, String> {
+        if at.started != sent.token {
+            return self.withdraw((motion, work), sent, why).await;
+        }
         let program = motion.send(motion.stop_program()).await;
         let until = Instant::now() + BRAKED;
         // The connection is not used after a dropped future.
         while let Ok(Ok(at)) = timeout_at(until, self.state()).await {
             if at.runtime == STOPPED {
-                return why.to_owned();
+                return Ok(why.to_owned());
             }
         }
         let stopped = program.map_or(NOT_SENT, |_| SENT);
         let why = format!("{why}, and its program may go on when it is released");
-        unknown(work, &why, stopped).await
+        Err(unknown(work, &why, stopped).await)
     }
 
     /// Stops a program that the robot has not started. The stop program follows on the same

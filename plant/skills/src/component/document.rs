@@ -381,7 +381,7 @@ fn read_robot(node: &Node, reader: &mut Reader<'_>) -> Option<Robot> {
 fn read_axes(node: &Node, reader: &mut Reader<'_>) -> Option<usize> {
     let text = reader.text(node, "a number of axes")?;
     let axes = text
-        .parse()
+        .parse::<usize>()
         .ok()
         .filter(|axes| (1..=MOST_AXES).contains(axes));
     axes.or_else(|| {

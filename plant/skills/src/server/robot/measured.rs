@@ -76,7 +76,7 @@ pub(super) fn safety(
         let mode = value.and_then(Value::as_f64);
         let stops = mode.map(|mode| [EMERGENCY, PROTECTIVE].map(|modes| modes.contains(&mode)));
         match stops {
-            Some([emergency, protective]) => vec![Some(emergency.into()), Some(protective.into())],
+            Some(stops) => stops.map(|stops| Some(Variant::Boolean(stops))).to_vec(),
             None => vec![None, None],
         }
     };
@@ -117,7 +117,7 @@ fn keep(
 fn shown_part(part: Option<Variant>, status: StatusCode, reading: &Reading) -> DataValue {
     let status = match part {
         None if !status.is_bad() => StatusCode::BadNoData,
-        _ => status,
+        Some(_) | None => status,
     };
     DataValue {
         value: Some(part.unwrap_or_default()),
