@@ -7,7 +7,9 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use skills::{ClientOptions, Detector, FoundSkill, Runs as _, SkillClient, SkillFault, TypeName};
-use system_tests::{Cell, Child, Peer, Segment, Site, Started, eventually, metrics, program};
+use system_tests::{
+    Cell, Child, Peer, Segment, Site, Started, eventually, http_get, metrics, program,
+};
 
 use super::{SOON, STATUS};
 
@@ -408,4 +410,63 @@ fn a_composite_uses_a_robot_of_another_workstation_and_is_run_from_the_cell() {
     // The robot stands beyond both stations; the gripper beside the composite.
     assert!(trace.contains(&format!("#{ROBOT}: named")), "{trace}");
     assert!(trace.contains("MovePickApproachBefore"), "{trace}");
+}
+
+#[test]
+fn a_mes_runs_a_process_with_components_behind_two_stations() {
+    const PROCESS: &str = "urn:ua-bridge:system-tests:fetch";
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let tower = tower(&cell);
+    let _stations = [station(&tower, 0), station(&tower, 1)];
+    let _robot = robot(&cell, &tower);
+    let _gripper = component(&gripper(&cell), &tower.devices[1], 22);
+    let yaml = format!(
+        "mes: mes
+application_uri: urn:ua-bridge:system-tests:mes
+namespace: 50
+endpoint: opc.tcp://{top}.50:0
+security: [None]
+processes:
+  - process: {PROCESS}
+    within: 60 s
+    wait: 60 s
+    steps:
+      - step: over
+        needs: {{skill: {{type: PtpMoveSkillType}}}}
+        parameters: {{TargetPosition: [0.4, 0.1, 0.4, 0, 0, 0]}}
+      - {{step: grip, needs: {{skill: {{type: GraspSkillType}}}}}}
+      - step: away
+        needs: {{skill: {{type: LinearMoveSkillType}}}}
+        parameters: {{TargetPosition: [0.4, 0.1, 0.45, 0, 0, 0]}}
+        by: {{component_of: over}}
+      - {{step: let go, needs: {{skill: {{type: ReleaseSkillType}}}}}}
+",
+        top = LEVELS[2]
+    );
+    let _mes = Started::new("ua-mes", &program("ua-mes"))
+        .args([cell.file("mes.yaml", &yaml)])
+        .args(["--interface", "top0", "--lds", "none", "--run", PROCESS])
+        .at(&tower.client)
+        .start();
+    let done = eventually("the process has ended", SOON * 3, || {
+        let page = tower
+            .client
+            .within(|| http_get("127.0.0.1:8087", "/status"))?;
+        let page: Value = serde_json::from_str(&page).ok()?;
+        let run = page["runs"][0].clone();
+        matches!(run["outcome"].as_str(), Some("done" | "failed" | "unknown")).then_some(run)
+    });
+    assert_eq!(done["outcome"], "done", "{done}");
+    let ran = done["plans"][0]["ran"].as_array().unwrap();
+    let ran: Vec<(&Value, &Value)> = ran
+        .iter()
+        .map(|of| (&of["step"], &of["component"]))
+        .collect();
+    let (robot, gripper) = (json!(ROBOT), json!(GRIPPER));
+    let steps = ["over", "grip", "away", "let go"].map(|step| json!(step));
+    let by = [&robot, &gripper, &robot, &gripper];
+    let expected: Vec<(&Value, &Value)> = steps.iter().zip(by).collect();
+    assert_eq!(ran, expected, "{done}");
 }
