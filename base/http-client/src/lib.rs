@@ -7,7 +7,7 @@ use http_body_util::{BodyExt as _, Full, Limited};
 use hyper::client::conn::http1::{SendRequest, handshake};
 use hyper_util::rt::TokioIo;
 use thiserror::Error;
-use tokio::net::TcpStream;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::task::JoinSet;
 
 pub use hyper::{Method, Request, Response, StatusCode, header};
@@ -32,11 +32,14 @@ pub enum HttpError {
 }
 
 impl Connection {
-    /// Prepares a stream for a request.
+    /// Prepares a stream, such as a TCP connection with or without TLS, for a request.
     ///
     /// # Errors
     /// [`HttpError::Exchange`].
-    pub async fn open(stream: TcpStream) -> Result<Self, HttpError> {
+    pub async fn open<S>(stream: S) -> Result<Self, HttpError>
+    where
+        S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    {
         let (sender, connection) = handshake(TokioIo::new(stream)).await?;
         let mut driving = JoinSet::new();
         driving.spawn(connection);
@@ -66,7 +69,7 @@ impl Connection {
 #[cfg(test)]
 mod tests {
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
-    use tokio::net::TcpListener;
+    use tokio::net::{TcpListener, TcpStream};
 
     use super::*;
 

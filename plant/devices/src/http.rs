@@ -1,4 +1,5 @@
-//! HTTP/1.1 client of devices: one connection per request, responses bounded in time and size.
+//! HTTP/1.1 client of devices, with or without TLS: one connection per request, responses bounded in
+//! time and size.
 
 use std::fmt;
 use std::time::Duration;
@@ -10,14 +11,27 @@ use serde_json::Value;
 use tokio::time::{Instant, timeout_at};
 
 use crate::modbus::connected;
+use crate::tls::Tls;
 
-/// The server of a device, by its host and port.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Host(pub(crate) String);
+/// The server of a device.
+#[derive(Debug, Clone)]
+pub(crate) struct Host {
+    /// Host and port.
+    address: String,
+    /// `None` for plain HTTP.
+    tls: Option<Tls>,
+}
+
+impl PartialEq for Host {
+    fn eq(&self, other: &Self) -> bool {
+        self.address == other.address && self.tls.is_some() == other.tls.is_some()
+    }
+}
 
 impl fmt::Display for Host {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "http://{}", self.0)
+        let scheme = if self.tls.is_some() { "https" } else { "http" };
+        write!(f, "{scheme}://{}", self.address)
     }
 }
 
@@ -59,6 +73,19 @@ impl fmt::Display for Fault {
 }
 
 impl Host {
+    /// Creates a server without TLS, by its host and port.
+    pub(crate) const fn plain(address: String) -> Self {
+        Self { address, tls: None }
+    }
+
+    /// Creates a server with TLS.
+    pub(crate) const fn secured(address: String, tls: Tls) -> Self {
+        Self {
+            address,
+            tls: Some(tls),
+        }
+    }
+
     /// Sends a request and returns its response; null for a response without a body.
     ///
     /// # Errors
@@ -86,12 +113,17 @@ impl Host {
             Fault::Unreachable(format!("{self} cannot be reached: {error}"))
         };
         let connecting = async {
-            let stream = connected(&self.0)
+            let stream = connected(&self.address)
                 .await
                 .map_err(|error| unreachable(&error))?;
-            Connection::open(stream)
-                .await
-                .map_err(|error| unreachable(&error))
+            let opened = match &self.tls {
+                None => Connection::open(stream).await,
+                Some(tls) => {
+                    let secured = tls.connect(stream).await;
+                    Connection::open(secured.map_err(|error| unreachable(&error))?).await
+                }
+            };
+            opened.map_err(|error| unreachable(&error))
         };
         let connection = timeout_at(until, connecting)
             .await
@@ -100,7 +132,7 @@ impl Host {
         let request = Request::builder()
             .method(asked.method)
             .uri(asked.path)
-            .header(HOST, &self.0)
+            .header(HOST, &self.address)
             .header(CONTENT_TYPE, "application/json")
             .body(Bytes::from(body))
             .map_err(|error| {

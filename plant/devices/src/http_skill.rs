@@ -18,6 +18,7 @@ use tokio::time::{Instant, sleep, sleep_until};
 
 use crate::http::{Asked, Fault, Host};
 use crate::sensors::ticks;
+use crate::tls::{self, Tls};
 
 /// A request of the YAML.
 #[derive(Debug, Clone, PartialEq)]
@@ -531,24 +532,30 @@ fn read_template(node: &Node, usual: &str, reader: &mut Reader<'_>) -> Option<Te
     })
 }
 
-/// Reads `http://host[:port]/path`.
+/// Reads `http://host[:port]/path`, or the same with `https`.
 fn read_url(node: &Node, reader: &mut Reader<'_>) -> Option<(Host, String)> {
     let text = reader.text(node, "a URL, as http://10.0.0.9/api/state")?;
     let wrong = |reader: &mut Reader<'_>| {
-        let message = format!("expected http://host[:port]/path, found `{text}`");
+        let message = format!("expected http://host[:port]/path or https://, found `{text}`");
         reader.refuse(node, Code::WrongValue, message)
     };
-    let Some(rest) = text.strip_prefix("http://") else {
+    let schemes = [("http://", 80, false), ("https://", 443, true)];
+    let known = schemes
+        .iter()
+        .find_map(|(scheme, port, secured)| Some((text.strip_prefix(scheme)?, port, *secured)));
+    let Some((rest, usual_port, is_secured)) = known else {
         return wrong(reader);
     };
     let (host, path) = match rest.find(['/', '?']) {
         Some(at) => rest.split_at(at),
         None => (rest, ""),
     };
-    let address = match host.rsplit_once(':') {
-        Some((_, port)) if port.parse::<u16>().is_ok_and(|port| port > 0) => host.to_owned(),
+    let (name, address) = match host.rsplit_once(':') {
+        Some((name, port)) if port.parse::<u16>().is_ok_and(|port| port > 0) => {
+            (name, host.to_owned())
+        }
         Some(_) => return wrong(reader),
-        None => format!("{host}:80"),
+        None => (host, format!("{host}:{usual_port}")),
     };
     let clean = |text: &str| {
         text.bytes()
@@ -561,7 +568,14 @@ fn read_url(node: &Node, reader: &mut Reader<'_>) -> Option<(Host, String)> {
         true => path.to_owned(),
         false => format!("/{path}"),
     };
-    Some((Host(address), path))
+    if !is_secured {
+        return Some((Host::plain(address), path));
+    }
+    let tls = tls::authorities().and_then(|authorities| Tls::new(name, authorities));
+    match tls {
+        Ok(tls) => Some((Host::secured(address, tls), path)),
+        Err(why) => reader.refuse(node, Code::WrongValue, format!("`{text}`: {why}")),
+    }
 }
 
 /// Converts a tree to JSON. Scalars are numbers and Booleans as far as they are such.

@@ -20,6 +20,7 @@ pub mod module;
 pub mod robotiq;
 pub mod schmalz;
 mod sensors;
+mod tls;
 mod tty;
 pub mod ur;
 

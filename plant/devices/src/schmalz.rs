@@ -179,7 +179,7 @@ impl Port {
     /// Creates the port of an alias at the master at `host:port`.
     pub(crate) fn new(master: &str, alias: &str) -> Self {
         Self {
-            master: Host(master.to_owned()),
+            master: Host::plain(master.to_owned()),
             alias: alias.to_owned(),
         }
     }

@@ -257,9 +257,13 @@ mod tests {
         // A segment of RFC 9293 without data, from 10.77.0.1:4840 to 10.77.0.2:50000.
         let mut frame = vec![0; ETHERNET];
         frame[12..14].copy_from_slice(&[0x08, 0x00]);
-        let ip = [0x45, 0, 0, 40, 0, 0, 0x40, 0, 64, TCP, 0, 0, 10, 77, 0, 1, 10, 77, 0, 2];
+        let ip = [
+            0x45, 0, 0, 40, 0, 0, 0x40, 0, 64, TCP, 0, 0, 10, 77, 0, 1, 10, 77, 0, 2,
+        ];
         frame.extend(ip);
-        let tcp = [0x12, 0xe8, 0xc3, 0x50, 0, 0, 0, 1, 0, 0, 0, 2, 0x50, 0x10, 1, 0, 0xde, 0xad, 0, 0];
+        let tcp = [
+            0x12, 0xe8, 0xc3, 0x50, 0, 0, 0, 1, 0, 0, 0, 2, 0x50, 0x10, 1, 0, 0xde, 0xad, 0, 0,
+        ];
         frame.extend(tcp);
         // Padding does not count.
         frame.extend([0xff; 6]);

@@ -1,16 +1,26 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
+use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use program::{Method, State};
+use rustls::RootCertStore;
+use rustls::pki_types::pem::PemObject as _;
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use skills::{
     Authority, Component, DriverSetup, Facts, Outcome, Owner, Skill, TypeName, conformance, model,
 };
-use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
+use tokio_rustls::TlsAcceptor;
 
 use super::*;
 use crate::Kinds;
+
+/// A connection with or without TLS.
+trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
+
+impl<T: AsyncRead + AsyncWrite + Unpin + Send> Stream for T {}
 
 /// A device that answers requests as its fields say, and records them.
 #[derive(Debug, Default)]
@@ -57,6 +67,11 @@ struct Bench {
 
 impl Bench {
     async fn new(start: u16, states: &[&'static str]) -> Self {
+        Self::over(None, start, states).await
+    }
+
+    /// Creates a device that answers with or without TLS.
+    async fn over(tls: Option<TlsAcceptor>, start: u16, states: &[&'static str]) -> Self {
         let press = Arc::new(Mutex::new(Press {
             start,
             states: states.to_vec(),
@@ -68,9 +83,16 @@ impl Bench {
         let served = Arc::clone(&press);
         task.spawn(async move {
             let mut clients = JoinSet::new();
-            while let Ok((mut stream, _)) = listener.accept().await {
-                let press = Arc::clone(&served);
+            while let Ok((stream, _)) = listener.accept().await {
+                let (press, tls) = (Arc::clone(&served), tls.clone());
                 clients.spawn(async move {
+                    let mut stream: Box<dyn Stream> = match tls {
+                        None => Box::new(stream),
+                        Some(tls) => match tls.accept(stream).await {
+                            Ok(stream) => Box::new(stream),
+                            Err(_refused) => return,
+                        },
+                    };
                     let mut bytes = Vec::new();
                     let mut chunk = [0; 1024];
                     loop {
@@ -105,6 +127,7 @@ impl Bench {
                         );
                         // The client may be gone.
                         let _written = stream.write_all(answer.as_bytes()).await;
+                        let _flushed = stream.flush().await;
                         return;
                     }
                 });
@@ -235,11 +258,56 @@ async fn a_request_that_is_withdrawn_before_it_is_sent_is_not_sent() {
         body: None,
         within: WITHIN,
     };
-    let host = Host(bench.address.clone());
+    let host = Host::plain(bench.address.clone());
     let fault = host.ask_unless(asked, || true).await.unwrap_err();
     let why = "Halt came before the request was sent".to_owned();
     assert_eq!(fault, Fault::Unreachable(why));
     assert!(bench.seen().is_empty());
+}
+
+#[tokio::test]
+async fn a_device_behind_tls_is_asked_only_if_its_certificate_is_trusted() {
+    let folder = std::env::temp_dir().join(format!("devices-https-{}", std::process::id()));
+    let pki = Pki::open(folder.clone()).unwrap();
+    let hosts = ["127.0.0.1".to_owned()];
+    pki.ensure_own_at("urn:test:press", &hosts).unwrap();
+    let own = CertificateDer::from(std::fs::read(folder.join(OWN_CERTIFICATE)).unwrap());
+    let key = PrivateKeyDer::from_pem_file(folder.join(OWN_KEY)).unwrap();
+    std::fs::remove_dir_all(&folder).unwrap();
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let config = rustls::ServerConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()
+        .unwrap()
+        .with_no_client_auth()
+        .with_single_cert(vec![own.clone()], key)
+        .unwrap();
+    let acceptor = TlsAcceptor::from(Arc::new(config));
+    let bench = Bench::over(Some(acceptor), 200, &[]).await;
+    let ask = async |host: &str, trusted: bool| {
+        let mut authorities = RootCertStore::empty();
+        if trusted {
+            authorities.add(own.clone()).unwrap();
+        }
+        let tls = Tls::new(host, authorities).unwrap();
+        let host = Host::secured(bench.address.clone(), tls);
+        let asked = Asked {
+            method: "POST",
+            path: "/start",
+            body: None,
+            within: WITHIN,
+        };
+        host.ask(asked).await
+    };
+    let answer = ask("127.0.0.1", true).await.unwrap();
+    assert_eq!(answer["gripped"], true);
+    assert_eq!(bench.seen(), ["POST /start"]);
+    for (host, trusted) in [("127.0.0.1", false), ("press.example", true)] {
+        let fault = ask(host, trusted).await.unwrap_err();
+        let told = fault.to_string();
+        assert!(matches!(fault, Fault::Unreachable(_)), "{told}");
+        assert!(told.starts_with("https://127.0.0.1:"), "{told}");
+    }
+    assert_eq!(bench.seen(), ["POST /start"], "nothing else was sent");
 }
 
 #[tokio::test]
@@ -363,7 +431,8 @@ fn a_parameter_does_not_leave_its_segment_of_a_path() {
 fn wrong_requests_are_findings() {
     for (http, expected) in [
         ("{}", "`start` is missing"),
-        ("{start: \"https://h/x\"}", "expected http://host"),
+        ("{start: \"ftp://h/x\"}", "expected http://host"),
+        ("{start: \"https://h:0/x\"}", "expected http://host"),
         ("{start: \"http://h:0/x\"}", "expected http://host"),
         ("{start: \"http://a@h/x\"}", "expected http://host"),
         (
