@@ -249,7 +249,7 @@ mod tests {
     #[test]
     fn a_help_is_wrapped_between_words_and_keeps_its_columns() {
         let help = "Show the values of a topic\n\nCommands:\n  hz    Measure the rate of it\n\n      --json\n          Print a JSON object per value\n";
-        let wanted = "Show the values of\na topic\n\nCommands:\n  hz    Measure\n        the rate of\n        it\n\n      --json\n          Print a\n          JSON\n          object per\n          value\n";
+        let wanted = "Show the values of a\ntopic\n\nCommands:\n  hz    Measure the\n        rate of it\n\n      --json\n          Print a\n          JSON\n          object per\n          value\n";
         assert_eq!(help_within(20, help), wanted);
     }
 
