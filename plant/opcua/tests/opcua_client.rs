@@ -129,7 +129,7 @@ async fn a_server_that_says_nothing_more_is_taken_for_down() {
     // A proxy between client and server stops forwarding, as if a cable were pulled.
     let line = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("opc.tcp://{}", line.local_addr().unwrap());
-    let (cut, is_cut) = tokio::sync::watch::channel(false);
+    let (cut, is_cut) = watch::channel(false);
     let server = format!("127.0.0.1:{}", cell.server.port());
     let relaying = tokio::spawn(async move {
         loop {
