@@ -70,6 +70,12 @@ pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Resul
     )
 }
 
+/// Measures manifests, NodeSets and questions of the knowledge of the plant.
+pub(crate) fn knowledge(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    let packages = [links::TARGET, "system-tests"];
+    measured(workspace, "bench-knowledge", &packages, arguments)
+}
+
 /// Measures conversions between ROS bytes and UADP fields, and Python serializers for the ROS half
 /// of the conversion.
 pub(crate) fn messages(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {

@@ -51,6 +51,7 @@ cargo xtask <verb>
   bench images [ARGS]            measure images and point clouds through both bridges beside Fast DDS and Cyclone DDS over UDP
   bench opcua [ARGS]             measure ua-server beside servers of asyncua and node-opcua, and what comes from the space to clients
   bench redundancy [FAULTS]      measure the gaps of random faults of two redundant bridges at 1 kHz, 200 unless told
+  bench knowledge [ARGS]         measure manifests, NodeSets, questions, the journal and plans of the knowledge of the plant
   bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding)
   bench charts [--check]         draw the pictures of docs/benchmarks.md from its tables; or only check that they are current
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
@@ -99,6 +100,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
             let arguments = [&[*part], rest].concat();
             bench::ros2(&Workspace::find()?, &arguments)
         }
+        ["bench", "knowledge", rest @ ..] => bench::knowledge(&Workspace::find()?, rest),
         ["bench", "opcua", rest @ ..] => bench::opcua(&Workspace::find()?, rest),
         ["bench", "redundancy", rest @ ..] => bench::redundancy(&Workspace::find()?, rest),
         ["bench", "skills", rest @ ..] => bench::skills(&Workspace::find()?, rest),
