@@ -7,6 +7,8 @@ use std::time::Duration;
 
 use knowledge::{Knowledge, Question, Source, SourceKind};
 use mtp::Module;
+use mtp::state::{Command as ServiceCommand, State};
+use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Peer, Started, eventually, http_get, program};
 use test_data::{foreign, own};
@@ -420,6 +422,93 @@ fn a_service_of_a_module_is_called_as_a_skill() {
     assert!(said.contains("Turns is from"), "{said}");
     let info = space(&["skills", "info", "module.Duet-Tango", "--interface", "lo"]);
     assert!(stdout(&info).contains("Tempo"), "{info:?}");
+}
+
+#[test]
+fn a_service_is_run_once_by_a_command_that_ctrl_c_stops() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let _module = simulated("stage.aml", &[]);
+    let stage = own("mtp/stage.aml").display().to_string();
+    let run = |more: &[&str]| space(&[&["mtp", "run", &stage], more].concat());
+    let polka = run(&["Solo", "--procedure", "Polka", "--json"]);
+    assert!(polka.status.success(), "{polka:?}");
+    let told = stdout(&polka);
+    let lines: Vec<Value> = told
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert!(lines.contains(&json!({"step": "Execute"})), "{told}");
+    assert_eq!(lines.last().unwrap()["end"]["succeeded"], true, "{told}");
+    let high = run(&["Duet", "--procedure", "Tango", "Tempo=42.5", "Turns=700"]);
+    assert_eq!(high.status.code(), Some(1), "{high:?}");
+    let why = String::from_utf8_lossy(&high.stderr).into_owned();
+    assert!(why.contains("Turns is from 1 to 100"), "{why}");
+    for wrong in [&["Trio"][..], &["Duet", "--procedure", "Tango", "Tempo=x"]] {
+        let refused = run(wrong);
+        assert_eq!(refused.status.code(), Some(64), "{refused:?}");
+    }
+    let mut waltz = Started::new("waltz", &program("ua-space"))
+        .args(["mtp", "run", &stage, "Duet", "--procedure", "Waltz"])
+        .start();
+    waltz.wait_for_line("Execute", SOON);
+    waltz.signal(Signal::SIGINT);
+    let status = waltz.wait_for_end(SOON);
+    assert_eq!(status.code(), Some(130), "{waltz}");
+    waltz.wait_for_line("the service is Stopped", SOON);
+    let again = run(&["Duet", "--procedure", "Waltz", "RunTime=0.1"]);
+    assert!(again.status.success(), "{again:?}");
+    assert!(
+        stdout(&again).contains("reset"),
+        "it was stopped: {again:?}"
+    );
+    drop(cell);
+}
+
+#[test]
+fn a_module_of_mtppy_runs_and_its_state_machine_is_ours() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let said = cell.asyncua_once("mtppy_pea.py", &["table"]);
+    let cells = said[0]["table"].as_array().unwrap();
+    assert_eq!(cells.len(), 160);
+    let mut others = Vec::new();
+    for cell in cells {
+        let name = |at: usize| cell[at].as_str().unwrap();
+        let state = State::of_name(name(0)).unwrap();
+        let command = ServiceCommand::of_name(name(1)).unwrap();
+        let theirs = State::of_name(name(2)).filter(|after| *after != state);
+        assert_eq!(theirs.is_some(), cell[3], "CommandEn: {cell}");
+        if state.after(command) != theirs {
+            others.push(format!("{state} {command}"));
+        }
+    }
+    // MTPPy allows Complete in more states.
+    let more = ["Starting", "Paused", "Unholding", "Pausing", "Resuming"];
+    let mut more: Vec<String> = more
+        .iter()
+        .map(|state| format!("{state} Complete"))
+        .collect();
+    (others.sort(), more.sort());
+    assert_eq!(others, more);
+
+    let endpoint = "opc.tcp://127.0.0.1:4840";
+    let mut module = cell
+        .asyncua_started("mtppy_pea.py", &["serve", endpoint])
+        .start();
+    let manifest = module.wait_for_json("the manifest", SOON, |line| {
+        line["manifest"].as_str().map(str::to_owned)
+    });
+    let file = cell.file("stirrer.aml", &manifest).display().to_string();
+    let run = |more: &[&str]| space(&[&["mtp", "run", &file, "Stir"], more].concat());
+    let quick = run(&["--procedure", "Quick", "Time=0.3"]);
+    assert!(quick.status.success(), "{quick:?}");
+    assert!(stdout(&quick).contains("Turns: 7"), "{quick:?}");
+    // It has to be reset: the word of Resetting is 32678 in MTPPy.
+    let slow = run(&["RunTime=0.3"]);
+    assert!(slow.status.success(), "{slow:?}");
+    let stopped = run(&["--run-timeout", "3"]);
+    assert_eq!(stopped.status.code(), Some(1), "{stopped:?}");
 }
 
 #[test]

@@ -107,7 +107,10 @@ async fn follow(
         (false, true) => Err(Failure::Unavailable(format!(
             "the end is unknown, and the module may still work: {message}"
         ))),
-        (false, false) if is_interrupted => Err(Failure::Interrupted),
+        (false, false) if is_interrupted => {
+            say(&message)?;
+            Err(Failure::Interrupted)
+        }
         (false, false) => Err(Failure::Failed(message)),
     })
 }

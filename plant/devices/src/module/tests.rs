@@ -202,11 +202,11 @@ async fn a_service_is_started_by_its_name_and_that_of_a_procedure() {
             Ok(skill) => skill.facts().name.clone(),
             Err(fault) => fault.0,
         };
-    assert_eq!(name("Solo", None), "Solo-Polka");
+    assert_eq!(name("Solo", None), "Solo-Waltz", "the default");
     assert_eq!(name("Duet", Some("Tango")), "Duet-Tango");
     assert_eq!(
-        name("Duet", Some("Polka")),
-        "Duet has no procedure `Polka`; its procedures are Waltz, Tango"
+        name("Duet", Some("Jive")),
+        "Duet has no procedure `Jive`; its procedures are Waltz, Tango, Polka"
     );
     let none = name("Trio", None);
     assert!(
