@@ -57,6 +57,10 @@ async def run(url, process):
             while (await states())[name] == 3:
                 await asyncio.sleep(0.05)
 
+        async def interrupted(name):
+            while (await states())[name] != 4:
+                await asyncio.sleep(0.05)
+
         await call("Store", order("one", process))
         await call("Store", order("two", "urn:nothing"))
         await call("Stop", "one")
@@ -64,6 +68,9 @@ async def run(url, process):
         await call("Clear", "one")
         await ended("one")
         await call("StoreAndStart", order("three", process))
+        await call("Pause", "three")
+        await interrupted("three")
+        await call("Resume", "three")
         await call("Stop", "three")
         await ended("three")
         response, status = await provider.call_method(

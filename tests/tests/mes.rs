@@ -590,6 +590,8 @@ fn a_recipe_of_batchml_runs_as_a_job_order_of_an_opcua_client() {
         ("Start", 1),
         ("Clear", 8),
         ("StoreAndStart", 1),
+        ("Pause", 1),
+        ("Resume", 1),
         ("Stop", 1),
         ("Clear", 1),
     ];
