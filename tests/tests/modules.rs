@@ -429,7 +429,7 @@ fn a_service_is_run_once_by_a_command_that_ctrl_c_stops() {
     let Some(cell) = Cell::with(&[]) else { return };
     let _module = simulated("stage.aml", &[]);
     let stage = own("mtp/stage.aml").display().to_string();
-    let run = |more: &[&str]| space(&[&["mtp", "run", &stage], more].concat());
+    let run = |more: &[&str]| space(&[&["mtp", "run", stage.as_str()][..], more].concat());
     let polka = run(&["Solo", "--procedure", "Polka", "--json"]);
     assert!(polka.status.success(), "{polka:?}");
     let told = stdout(&polka);
@@ -500,7 +500,7 @@ fn a_module_of_mtppy_runs_and_its_state_machine_is_ours() {
         line["manifest"].as_str().map(str::to_owned)
     });
     let file = cell.file("stirrer.aml", &manifest).display().to_string();
-    let run = |more: &[&str]| space(&[&["mtp", "run", &file, "Stir"], more].concat());
+    let run = |more: &[&str]| space(&[&["mtp", "run", file.as_str(), "Stir"][..], more].concat());
     let quick = run(&["--procedure", "Quick", "Time=0.3"]);
     assert!(quick.status.success(), "{quick:?}");
     assert!(stdout(&quick).contains("Turns: 7"), "{quick:?}");

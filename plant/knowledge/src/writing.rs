@@ -243,20 +243,6 @@ impl Change {
     }
 }
 
-/// Changes the graph of derived statements.
-pub(crate) fn derive(
-    transaction: &mut Transaction<'_>,
-    derived: &Derived,
-) -> Result<(), KnowledgeFault> {
-    let graph = named(DERIVED)?;
-    Ok(apply(
-        transaction,
-        &graph,
-        &derived.added,
-        &derived.removed,
-    )?)
-}
-
 /// Returns the statements to add to a graph and to remove from it.
 fn difference(
     transaction: &Transaction<'_>,
@@ -272,21 +258,20 @@ fn difference(
     Ok((added, removed))
 }
 
-fn apply(
+/// Changes the graph of derived statements.
+pub(crate) fn derive(
     transaction: &mut Transaction<'_>,
-    graph: &NamedNode,
-    added: &[Triple],
-    removed: &[Triple],
-) -> Result<(), StorageError> {
-    // The store keeps literals in their canonical form: `.120Z` is added again while `.12Z` is
-    // removed. Statements are therefore removed before others are added.
+    derived: &Derived,
+) -> Result<(), KnowledgeFault> {
+    let graph = named(DERIVED)?;
+    let Derived { added, removed, .. } = derived;
     for triple in removed {
-        transaction.remove(triple.as_ref().in_graph(graph));
+        transaction.remove(triple.as_ref().in_graph(&graph));
     }
     for triple in added {
-        transaction.insert(triple.as_ref().in_graph(graph));
+        transaction.insert(triple.as_ref().in_graph(&graph));
     }
-    merge(transaction, graph, added, removed)
+    Ok(merge(transaction, &graph, added, removed)?)
 }
 
 /// Updates the default graph after a change of a graph.
