@@ -465,6 +465,30 @@ fn a_service_is_run_once_by_a_command_that_ctrl_c_stops() {
 }
 
 #[test]
+fn the_test_engines_of_the_association_accept_the_package_of_a_module() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    for name in ["stage.aml", "column.aml"] {
+        let manifest = own("mtp").join(name).display().to_string();
+        let package = cell.folder().join(format!("{name}.aasx"));
+        let package = package.display().to_string();
+        let made = space(&["aas", &manifest, "--aasx", &package]);
+        assert!(made.status.success(), "{made:?}");
+        let again = space(&["aas", &manifest, "--aasx", &package]);
+        assert_eq!(again.status.code(), Some(74), "no file is replaced");
+        let said = cell.asyncua_once("aas_judge.py", &[&package]);
+        let manifest = format!("aasx/files/{name}");
+        assert_eq!(
+            said,
+            [
+                json!({"ok": true, "faults": [], "parts": ["aasx/aasx-origin", "aasx/data.json", manifest]})
+            ]
+        );
+    }
+}
+
+#[test]
 fn a_module_of_mtppy_runs_and_its_state_machine_is_ours() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
