@@ -152,7 +152,7 @@ impl Doer {
 impl ActionClient for Doer {
     type Goal = Sent;
 
-    fn send_goal(&self, id: GoalId, body: &[u8]) -> Sent {
+    fn send_goal(&self, id: GoalId, body: &[u8], start_by: std::time::Instant) -> Sent {
         // The subscription starts before the run, so that no notification is missed.
         let heard = self.reporter.0.subscribe();
         let (skill, body) = (self.skill.clone(), body.to_vec());
@@ -162,6 +162,10 @@ impl ActionClient for Doer {
             if lock(&doing).beginning.get(&id) == Some(&true) {
                 lock(&doing).begun(id);
                 return Err("the goal was cancelled before its run began".to_owned());
+            }
+            if now().monotonic > start_by {
+                lock(&doing).begun(id);
+                return Err("the goal came too late, so no run was started".to_owned());
             }
             let run = begin(&skill, &body).await;
             let cancelled = {
