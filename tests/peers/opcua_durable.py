@@ -40,7 +40,8 @@ async def filled(endpoint):
         clients.append(client)
         server = Server(client, None)
         for _ in range(OF_A_SESSION):
-            result = await durable(server, await server.subscribed(), 1)
+            server.subscription = await server.subscribed()
+            result = await durable(server, server.subscription, 1)
             if not result.StatusCode.is_good():
                 status = result.StatusCode.name
                 break
