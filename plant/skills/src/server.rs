@@ -211,7 +211,12 @@ impl ComponentServer {
         tasks.spawn(Lock::serve(&server, &authority, &root.node_id, &mut ids)?);
         if let Some(robot) = &component.robot {
             let of = (skills.as_slice(), values.live.as_slice());
-            tasks.spawn(robot::serve(&server, (&component.name, robot), of, &mut ids)?);
+            tasks.spawn(robot::serve(
+                &server,
+                (&component.name, robot),
+                of,
+                &mut ids,
+            )?);
         }
         tasks.spawn(shown);
         let values = (values, &configuration);
