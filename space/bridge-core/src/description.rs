@@ -10,22 +10,24 @@
 //! Property [`ROS_TOPICS`] of the first field lists the ROS topics of the mapping, and the Property
 //! `Command` marks a value that acts where it arrives.
 
+mod schema;
+
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
 use mappings::{Binding, Meaning, SpaceId, TopicId, Unit, Variable};
-use messages::{Leaf, MemberKind, MessageType, Rank, Selected, Selection, TypeName};
+use messages::{Leaf, MessageType, Rank, Selected, Selection, TypeName};
 use uadp::discovery::{
-    Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, DataTypeSchemaHeader,
-    EUInformation, EnumValueType, FieldMetaData, KeyValuePair, List, Range, Settings,
-    StructureDefinition, StructureDescription, StructureField, enum_strings, strings,
+    Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, EUInformation,
+    EnumValueType, FieldMetaData, KeyValuePair, List, Range, Settings, enum_strings, strings,
 };
 use uadp::{
-    BuiltinType, EncodeError, Guid, LocalizedText, NodeId, PublisherId, QualifiedName, Scalar,
+    BuiltinType, EncodeError, Guid, LocalizedText, PublisherId, QualifiedName, Scalar,
     SecurityHeader, StatusCode, Timestamp, Variant,
 };
 
+pub(crate) use self::schema::{data_type, list, sizes, value_rank, with_structures};
 use crate::call::{ValueDescription, join_name, split_name};
 use crate::learned::Weight;
 
@@ -437,46 +439,6 @@ impl Source<'_> {
     }
 }
 
-/// Calls `then` with the definitions of the structures among the fields of a message.
-pub(crate) fn with_structures<T>(
-    message_type: &MessageType,
-    leaves: &[Leaf],
-    (namespace, uris): (u16, &BTreeMap<u16, String>),
-    then: impl FnOnce(DataTypeSchemaHeader<'_>) -> Result<T, EncodeError>,
-) -> Result<T, EncodeError> {
-    let structures = structures(message_type, leaves);
-    let namespaces = match structures.is_empty() {
-        true => Vec::new(),
-        false => namespaces_up_to(namespace, uris),
-    };
-    let inner_sizes: Vec<Vec<Vec<u32>>> = structures.iter().map(member_sizes).collect();
-    let inner: Vec<Vec<StructureField<'_>>> = structures
-        .iter()
-        .zip(&inner_sizes)
-        .map(|(structure, sizes)| structure_fields(structure, sizes, namespace))
-        .collect();
-    let described: Vec<StructureDescription<'_>> = structures
-        .iter()
-        .zip(&inner)
-        .map(|(structure, fields)| structure_description(structure.name, fields, namespace))
-        .collect();
-    then(DataTypeSchemaHeader {
-        namespaces: list(&namespaces),
-        structure_data_types: list(&described),
-        ..DataTypeSchemaHeader::default()
-    })
-}
-
-/// Returns the list of namespaces up to the index that the TypeIds of ExtensionObjects use.
-fn namespaces_up_to(namespace: u16, uris: &BTreeMap<u16, String>) -> Vec<Option<&str>> {
-    if namespace > MAX_NAMESPACES {
-        return Vec::new();
-    }
-    (1..=namespace)
-        .map(|index| uris.get(&index).map(String::as_str))
-        .collect()
-}
-
 /// Returns the message type if all ROS bindings of the value use the same type as a whole.
 fn whole_message(variable: &Variable) -> Option<&TypeName> {
     let (first, rest) = variable.bindings.split_first()?;
@@ -591,107 +553,11 @@ fn command(variable: &Variable) -> Option<KeyValuePair<'static>> {
     acts.then_some(KeyValuePair { key, value })
 }
 
-/// Returns the types of the messages in arrays and of the messages nested in them, without
-/// duplicates.
-fn structures<'m>(message_type: &'m MessageType, leaves: &[Leaf]) -> Vec<messages::Structure<'m>> {
-    let mut all: Vec<messages::Structure<'m>> = Vec::new();
-    for leaf in leaves {
-        if leaf.builtin != BuiltinType::ExtensionObject {
-            continue;
-        }
-        for structure in message_type.structures(&leaf.path) {
-            if !all.iter().any(|known| known.name == structure.name) {
-                all.push(structure);
-            }
-        }
-    }
-    all
-}
-
 /// The name, description and array sizes of a field.
 struct FieldText {
     name: String,
     description: String,
     sizes: Vec<u32>,
-}
-
-fn member_sizes(structure: &messages::Structure<'_>) -> Vec<Vec<u32>> {
-    let ranks = structure.fields.iter().map(|field| field.rank);
-    ranks.map(sizes).collect()
-}
-
-fn structure_description<'s>(
-    name: &'s TypeName,
-    fields: &'s [StructureField<'s>],
-    namespace: u16,
-) -> StructureDescription<'s> {
-    StructureDescription {
-        data_type_id: NodeId::string(namespace, name.as_str()),
-        name: QualifiedName {
-            namespace,
-            name: Some(name.as_str()),
-        },
-        structure_definition: StructureDefinition {
-            default_encoding_id: NodeId::string(namespace, name.as_str()),
-            base_data_type: STRUCTURE,
-            fields: list(fields),
-            ..StructureDefinition::default()
-        },
-    }
-}
-
-fn structure_fields<'s>(
-    structure: &'s messages::Structure<'_>,
-    sizes: &'s [Vec<u32>],
-    namespace: u16,
-) -> Vec<StructureField<'s>> {
-    let fields = structure.fields.iter().zip(sizes);
-    fields
-        .map(|(field, sizes)| StructureField {
-            name: Some(field.name),
-            data_type: match field.kind {
-                MemberKind::Value(builtin) => data_type(builtin, None, namespace),
-                MemberKind::Message(of) => {
-                    data_type(BuiltinType::ExtensionObject, Some(of), namespace)
-                }
-            },
-            value_rank: value_rank(field.rank),
-            array_dimensions: list(sizes),
-            ..StructureField::default()
-        })
-        .collect()
-}
-
-/// Returns the DataType of a field. A message type and its encoding share a NodeId, the name of the
-/// type.
-pub(crate) fn data_type(builtin: BuiltinType, of: Option<&TypeName>, namespace: u16) -> NodeId<'_> {
-    match of {
-        Some(name) => NodeId::string(namespace, name.as_str()),
-        None => NodeId::numeric(0, builtin.id().into()),
-    }
-}
-
-pub(crate) const fn value_rank(rank: Rank) -> i32 {
-    match rank {
-        Rank::Scalar => -1,
-        Rank::Array { .. } => 1,
-    }
-}
-
-/// Returns the number of elements in each dimension; 0 for a variable length.
-pub(crate) fn sizes(rank: Rank) -> Vec<u32> {
-    match rank {
-        Rank::Scalar => Vec::new(),
-        Rank::Array { fixed } => vec![fixed.unwrap_or(0)],
-    }
-}
-
-/// Returns the list of the elements; the null array if there are no elements.
-pub(crate) const fn list<T>(elements: &[T]) -> List<'_, T> {
-    match elements {
-        [] => List::null(),
-        elements => List::new(elements),
-    }
 }
 
 pub(crate) const fn text(text: &str) -> LocalizedText<'_> {
@@ -721,8 +587,6 @@ pub(crate) fn version_time(utc: Timestamp) -> u32 {
     u32::try_from(seconds.max(0)).unwrap_or(u32::MAX)
 }
 
-/// The DataType Structure (OPC 10000-5, 12.2.12).
-const STRUCTURE: NodeId<'static> = NodeId::numeric(0, 22);
 /// Seconds from 1970 to 2000.
 const UNIX_2000: i128 = 946_684_800;
 /// The Property of the first field of a DataSet with the ROS topics and services of the value: an
@@ -742,8 +606,5 @@ const MESSAGE: &str = "message";
 pub(crate) const MAX_NAME: usize = 255;
 /// The maximum number of fields of a message.
 pub(crate) const MAX_FIELDS: usize = 4096;
-/// The maximum namespace index for which the list of namespaces is sent. The list grows with the
-/// index.
-const MAX_NAMESPACES: u16 = 64;
 /// The maximum size in bytes of an announcement.
 pub(crate) const MAX_ANNOUNCEMENT: usize = 64 << 10;

@@ -157,6 +157,35 @@ pub enum Output {
     Notice(Notice),
 }
 
+impl Output {
+    /// Returns the NetworkMessage of an output for the network, with the topic that counts its
+    /// drops. All other outputs are for this program.
+    pub(crate) const fn message_mut(&mut self) -> Option<(&mut Vec<u8>, Option<TopicId>)> {
+        match self {
+            Self::Datagram { topic, bytes, .. } | Self::Action { topic, bytes } => {
+                Some((bytes, Some(*topic)))
+            }
+            Self::Discovery { bytes } | Self::Heartbeat { bytes } => Some((bytes, None)),
+            Self::Role(_)
+            | Self::Delivery(_)
+            | Self::Unbound { .. }
+            | Self::Silent { .. }
+            | Self::CommanderLost { .. }
+            | Self::Retired { .. }
+            | Self::Answer { .. }
+            | Self::CallKnown { .. }
+            | Self::CallGone { .. }
+            | Self::Execute(_)
+            | Self::Abandoned { .. }
+            | Self::Settled { .. }
+            | Self::HandoverWanted { .. }
+            | Self::Taken { .. }
+            | Self::KeysWanted { .. }
+            | Self::Notice(_) => None,
+        }
+    }
+}
+
 /// Identifies a latched publisher of the local side among the publishers of its topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct PublisherKey(pub u32);

@@ -61,14 +61,15 @@ use crate::tap::{Crossing, Tapped};
 /// Decides which messages cross between a space and UADP. The crate documentation describes its
 /// use.
 ///
-/// The Router wires types that own their state and know each other only downwards: the values of
-/// topics, the reassembly of chunks, announcements and probes, calls, and security. After each
-/// input it plans the probes that values need.
+/// The Router wires types that own their state and know each other only downwards: the redundancy
+/// of the own space, the values of topics, the reassembly of chunks, announcements and probes,
+/// calls, security, and the changes of the role. After each input it plans the probes that values
+/// need.
 ///
 /// # Inputs
 /// - samples: [`handle_local`](Self::handle_local), [`handle_local_as`](Self::handle_local_as),
 ///   [`left`](Self::left), [`set_live`](Self::set_live),
-///   [`handle_datagram`](Self::handle_datagram).
+///   [`handle_datagram`](Self::handle_datagram), [`handle_received`](Self::handle_received).
 /// - types and metadata: [`bind`](Self::bind), [`bind_as`](Self::bind_as),
 ///   [`unbind`](Self::unbind), [`describe_value`](Self::describe_value),
 ///   [`introduce`](Self::introduce), [`call_the_roll`](Self::call_the_roll).
@@ -86,7 +87,8 @@ use crate::tap::{Crossing, Tapped};
 /// - settings: [`replace_mapping`](Self::replace_mapping), [`set_owned`](Self::set_owned),
 ///   [`claim`](Self::claim), [`set_part`](Self::set_part), [`set_source`](Self::set_source),
 ///   [`set_relay`](Self::set_relay), [`set_link`](Self::set_link),
-///   [`set_instance`](Self::set_instance), [`set_keys`](Self::set_keys), [`tap`](Self::tap).
+///   [`set_arrival`](Self::set_arrival), [`set_instance`](Self::set_instance),
+///   [`set_keys`](Self::set_keys), [`tap`](Self::tap).
 /// - redundancy: [`set_redundancy`](Self::set_redundancy),
 ///   [`show_values_at_standby`](Self::show_values_at_standby), [`set_fit`](Self::set_fit),
 ///   [`switch_over`](Self::switch_over).
@@ -99,6 +101,8 @@ use crate::tap::{Crossing, Tapped};
 /// # Timers
 /// - the time of the next call, and the call: [`poll_timeout`](Self::poll_timeout),
 ///   [`handle_timeout`](Self::handle_timeout).
+/// - a takeover that the next call would begin: [`takes_over`](Self::takes_over),
+///   [`defer_takeover`](Self::defer_takeover).
 ///
 /// # Queries
 /// - topics: [`topics`](Self::topics), [`heard`](Self::heard), [`is_full`](Self::is_full),

@@ -8,7 +8,7 @@ use uadp::{
     NetworkMessageType, PublisherId, Scalar, Timestamp, Variant,
 };
 
-use super::{Rank, Role};
+use super::role::{Rank, Role};
 
 /// The message by which redundant bridges of a space know each other.
 ///

@@ -6,7 +6,10 @@
 
 mod chunks;
 mod execute;
+mod executors;
 mod learn;
+mod own;
+mod send;
 mod takeover;
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -17,15 +20,15 @@ use std::time::{Duration, Instant};
 use mappings::{SpaceId, TopicId};
 use messages::{ServiceType, Wire};
 use uadp::action::{
-    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, ActionToSend, CallId,
-    CallRefusal, ExecutionId, Outcome, Refusal, Requestor, RequestorSettings, Responder,
-    ResponderSettings, ResponseDrop, Unknown,
+    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, CallId, CallRefusal,
+    ExecutionId, Outcome, Refusal, Requestor, RequestorSettings, Responder, ResponderSettings,
+    ResponseDrop, Unknown,
 };
-use uadp::{EncodeError, Extras, NetworkHeader, OwnedPublisherId, PublisherId, StatusCode};
+use uadp::{OwnedPublisherId, StatusCode};
 
-use self::chunks::{Chunking, Of};
-use self::execute::{Own, Running};
-use self::learn::{Group, Known};
+use self::chunks::Chunking;
+use self::executors::{Group, Known};
+use self::own::{Own, Running};
 use super::announcements::Announcements;
 use super::security::Security;
 use super::senders::RedundantSenders;
@@ -585,72 +588,6 @@ impl CallTraffic<'_> {
         self.settle(now);
     }
 
-    /// Returns the next output for the port about calls, or the next request or response to send.
-    pub(super) fn next_action(&mut self, now: Now) -> Option<Output> {
-        loop {
-            if let Some(chunk) = self.next_chunk(now) {
-                return Some(chunk);
-            }
-            let mut bytes = self.values.buffer();
-            match self.write_action(&mut bytes, now) {
-                Some(Told::Datagram(topic, _)) if bytes.len() <= self.most() => {
-                    return Some(Output::Action { topic, bytes });
-                }
-                Some(Told::Datagram(topic, of)) => self.cut_up(topic, of, bytes),
-                Some(Told::News(output)) => {
-                    self.values.recycle(bytes);
-                    return Some(output);
-                }
-                None => {
-                    self.values.recycle(bytes);
-                    return None;
-                }
-            }
-        }
-    }
-
-    fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
-        let header = self.values.action_header(now);
-        loop {
-            let calls = self.calls.as_mut()?;
-            if let Some(news) = calls.news.pop_front() {
-                return Some(Told::News(news));
-            }
-            if calls.due.is_none_or(|due| due > now.monotonic) {
-                return None;
-            }
-            let since = calls.since_start(now);
-            let answer = calls.responder.poll_transmit(since);
-            let answer =
-                answer.map(|(_, answer)| (Of::message(&answer), encode(&answer, &header, bytes)));
-            let next = answer.or_else(|| {
-                let request = calls.requestor.poll_transmit(since);
-                request.map(|request| (Of::message(&request), encode(&request, &header, bytes)))
-            });
-            match next {
-                // Timeouts that occurred in the meantime are output.
-                None => {
-                    self.settle(now);
-                    let calls = self.calls.as_mut()?;
-                    return calls.news.pop_front().map(Told::News);
-                }
-                Some((of, (Some(topic), Ok(())))) if !self.values.is_withheld(topic) => {
-                    return Some(Told::Datagram(topic, of));
-                }
-                Some((_, (Some(topic), Ok(())))) => {
-                    self.count_call(topic, None, (Reason::SpaceTaken, "withheld"), String::new);
-                }
-                Some((_, (topic, Err(error)))) => {
-                    if let Some(topic) = topic {
-                        self.count_call(topic, None, Reason::TooBig, || error.to_string());
-                    }
-                }
-                Some((_, (None, Ok(())))) => {}
-            }
-            bytes.clear();
-        }
-    }
-
     /// Counts a drop of a call as `Values::count` does for a topic.
     pub(super) fn count_call(
         &mut self,
@@ -677,39 +614,6 @@ impl CallTraffic<'_> {
 
 /// A request and the plan for its response.
 type Begun = (CallId, Option<Arc<CallPlan>>);
-
-/// The next output about calls.
-enum Told {
-    News(Output),
-    Datagram(TopicId, Of),
-}
-
-/// Encodes the NetworkMessage and returns the topic of its call.
-fn encode(
-    action: &ActionToSend<'_>,
-    header: &NetworkHeader<'_>,
-    bytes: &mut Vec<u8>,
-) -> (Option<TopicId>, Result<(), EncodeError>) {
-    let ActionAddress {
-        publisher_id,
-        writer_group_id,
-        writer_id,
-        ..
-    } = action.address;
-    let topic = match publisher_id.as_id() {
-        PublisherId::UInt16(space) => {
-            TopicId::new(space, writer_group_id.unwrap_or_default(), *writer_id)
-        }
-        PublisherId::Byte(_)
-        | PublisherId::UInt32(_)
-        | PublisherId::UInt64(_)
-        | PublisherId::String(_) => None,
-    };
-    let written = action
-        .encode(bytes, header, &Extras::default())
-        .and_then(uadp::action::ActionEncoder::finish);
-    (topic, written)
-}
 
 /// Appends a response in the local encoding.
 fn read(

@@ -48,19 +48,17 @@ impl Values {
 
     /// Returns whether an output is dropped, because another bridge sends it. Samples are muted
     /// where they are polled.
-    #[expect(
-        clippy::wildcard_enum_match_arm,
-        reason = "all other outputs are for this program"
-    )]
     pub(super) fn mutes(&mut self, output: &Output) -> bool {
-        match output {
-            Output::Retired { topic, instance } => self.drop_held(*topic, Some(*instance)),
-            Output::Silent {
-                topic,
-                silent: true,
-                ..
-            } => self.drop_held(*topic, None),
-            _ => {}
+        if let Output::Retired { topic, instance } = output {
+            self.drop_held(*topic, Some(*instance));
+        }
+        if let Output::Silent {
+            topic,
+            silent: true,
+            ..
+        } = output
+        {
+            self.drop_held(*topic, None);
         }
         if !self.is_muted() {
             return false;
@@ -70,7 +68,25 @@ impl Values {
             // Probes are sent, so that a standby learns what the active bridge knows.
             Output::Discovery { bytes } => !NetworkMessage::decode(bytes)
                 .is_ok_and(|message| message.message_type() == NetworkMessageType::Probe),
-            _ => false,
+            // Datagrams are muted where they are polled. All other outputs are for this program.
+            Output::Datagram { .. }
+            | Output::Heartbeat { .. }
+            | Output::Role(_)
+            | Output::Delivery(_)
+            | Output::Unbound { .. }
+            | Output::Silent { .. }
+            | Output::CommanderLost { .. }
+            | Output::Retired { .. }
+            | Output::Answer { .. }
+            | Output::CallKnown { .. }
+            | Output::CallGone { .. }
+            | Output::Execute(_)
+            | Output::Abandoned { .. }
+            | Output::Settled { .. }
+            | Output::HandoverWanted { .. }
+            | Output::Taken { .. }
+            | Output::KeysWanted { .. }
+            | Output::Notice(_) => false,
         }
     }
 

@@ -137,52 +137,20 @@ impl Security {
     }
 
     /// Seals an output. Returns `None` for a message that cannot be sent, and counts it.
-    #[expect(
-        clippy::wildcard_enum_match_arm,
-        reason = "all messages except datagrams are addressed to this program"
-    )]
-    pub(super) fn seal(&mut self, values: &mut Values, output: Output) -> Option<Output> {
+    pub(super) fn seal(&mut self, values: &mut Values, mut output: Output) -> Option<Output> {
         let Some(guard) = &mut self.guard else {
             return Some(output);
         };
-        let (bytes, topic) = match &output {
-            Output::Datagram { topic, bytes, .. } | Output::Action { topic, bytes } => {
-                (bytes, Some(*topic))
-            }
-            Output::Discovery { bytes } | Output::Heartbeat { bytes } => (bytes, None),
-            _ => return Some(output),
+        let Some((bytes, topic)) = output.message_mut() else {
+            return Some(output);
         };
         let mut sealed = values.buffer();
         match guard.seal(bytes, &mut sealed) {
-            Ok(false) => {
+            Ok(is_sealed) => {
+                if is_sealed {
+                    std::mem::swap(bytes, &mut sealed);
+                }
                 values.recycle(sealed);
-                Some(output)
-            }
-            Ok(true) => {
-                let (clear, output) = match output {
-                    Output::Datagram { topic, with, bytes } => {
-                        let bytes_out = sealed;
-                        (
-                            bytes,
-                            Output::Datagram {
-                                topic,
-                                with,
-                                bytes: bytes_out,
-                            },
-                        )
-                    }
-                    Output::Action { topic, bytes } => (
-                        bytes,
-                        Output::Action {
-                            topic,
-                            bytes: sealed,
-                        },
-                    ),
-                    Output::Discovery { bytes } => (bytes, Output::Discovery { bytes: sealed }),
-                    Output::Heartbeat { bytes } => (bytes, Output::Heartbeat { bytes: sealed }),
-                    other => (sealed, other),
-                };
-                values.recycle(clear);
                 Some(output)
             }
             Err(Unopened {

@@ -10,11 +10,6 @@ use uadp::{
     PublisherId, Whole,
 };
 
-use super::CallTraffic;
-use crate::counters::Reason;
-use crate::output::Output;
-use crate::settings::Now;
-
 /// The messages to send in chunks. Each request or response is queued at most once, so the queue is
 /// limited by the state of the Requestor and the Responder.
 #[derive(Debug, Default)]
@@ -29,7 +24,7 @@ pub(super) struct Chunking {
     numbers: BTreeMap<Of, u16>,
     given: VecDeque<Of>,
     /// Whether the queue has given way to a chunk of a value after its last chunk.
-    gave_way: bool,
+    pub(super) gave_way: bool,
 }
 
 /// Identifies a message by the number of its call.
@@ -66,7 +61,7 @@ impl Chunking {
     /// Queues a message, unless a message of the same call is still queued. A repetition has the
     /// MessageSequenceNumber of the first transmission, so that its chunks replace lost chunks
     /// (OPC 10000-14, 7.2.4.4.4).
-    fn push(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
+    pub(super) fn push(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
         if self.waiting.iter().any(|large| large.of == of) {
             return;
         }
@@ -96,7 +91,7 @@ impl Chunking {
     }
 
     /// Appends the next chunk.
-    fn write(
+    pub(super) fn write(
         &mut self,
         most: usize,
         start: &NetworkHeader<'_>,
@@ -145,48 +140,6 @@ impl Large {
         chunks.append(out, &extras).transpose()?;
         self.offset = chunks.offset();
         Ok(())
-    }
-}
-
-impl CallTraffic<'_> {
-    /// Returns the maximum size of a datagram in bytes.
-    pub(super) fn most(&self) -> usize {
-        self.values.sizes().0.into()
-    }
-
-    /// Queues a request or response that is larger than a datagram.
-    pub(super) fn cut_up(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
-        if let Some(calls) = &mut self.calls {
-            calls.chunking.push(topic, of, bytes);
-        }
-    }
-
-    /// Returns the next chunk if the pace allows it, alternating with the chunks of values.
-    pub(super) fn next_chunk(&mut self, now: Now) -> Option<Output> {
-        let values_wait = !self.values.paced.is_empty();
-        let most = self.most();
-        let header = self.values.action_header(now);
-        let calls = self.calls.as_mut()?;
-        let chunking = &mut calls.chunking;
-        if chunking.is_empty() || !self.values.pace.is_open(now.monotonic) {
-            return None;
-        }
-        if values_wait && !std::mem::replace(&mut chunking.gave_way, true) {
-            return None;
-        }
-        chunking.gave_way = false;
-        let mut bytes = Vec::new();
-        let (topic, written) = chunking.write(most, &header, &mut bytes)?;
-        match written {
-            Ok(()) => {
-                self.values.pace.spend(bytes.len(), now.monotonic);
-                Some(Output::Action { topic, bytes })
-            }
-            Err(error) => {
-                self.count_call(topic, None, Reason::TooBig, || error.to_string());
-                None
-            }
-        }
     }
 }
 

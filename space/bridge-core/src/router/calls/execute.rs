@@ -15,6 +15,7 @@ use uadp::{Fields, StatusCode};
 use super::super::About;
 use super::super::values::Values;
 use super::CallTraffic;
+use super::own::{Own, Running};
 use crate::call::{CallDescription, CallField, Executed, Execution, Offered, OfferedType};
 use crate::call_announcement::{CallAnnouncement, LASTING_TARGET, Types};
 use crate::call_plan::ExecutedPlan;
@@ -23,25 +24,6 @@ use crate::loop_rule::{Side, What};
 use crate::network::number_of;
 use crate::output::Output;
 use crate::settings::Now;
-
-/// A call of this program.
-#[derive(Debug)]
-pub(super) struct Own {
-    open: bool,
-    /// The plan for its payloads, if the local side uses ROS messages.
-    plan: Option<Arc<ExecutedPlan>>,
-    announcement: Option<CallAnnouncement>,
-}
-
-/// A request that the local side executes.
-#[derive(Debug)]
-pub(super) struct Running {
-    pub(super) topic: TopicId,
-    deadline: Instant,
-    /// The plan with which the request was read. A later change of the call does not affect the
-    /// execution.
-    plan: Option<Arc<ExecutedPlan>>,
-}
 
 impl CallTraffic<'_> {
     /// Adds or changes a call that the local side executes, and announces it. Calls of namespaces

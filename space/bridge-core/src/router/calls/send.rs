@@ -1,0 +1,152 @@
+//! The requests and responses to send, and the outputs for the port about calls.
+
+use mappings::TopicId;
+use uadp::action::{ActionAddress, ActionToSend};
+use uadp::{EncodeError, Extras, NetworkHeader, PublisherId};
+
+use super::CallTraffic;
+use super::chunks::Of;
+use crate::counters::Reason;
+use crate::output::Output;
+use crate::settings::Now;
+
+impl CallTraffic<'_> {
+    /// Returns the maximum size of a datagram in bytes.
+    fn most(&self) -> usize {
+        self.values.sizes().0.into()
+    }
+
+    /// Queues a request or response that is larger than a datagram.
+    fn cut_up(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
+        if let Some(calls) = &mut self.calls {
+            calls.chunking.push(topic, of, bytes);
+        }
+    }
+
+    /// Returns the next chunk if the pace allows it, alternating with the chunks of values.
+    fn next_chunk(&mut self, now: Now) -> Option<Output> {
+        let values_wait = !self.values.paced.is_empty();
+        let most = self.most();
+        let header = self.values.action_header(now);
+        let calls = self.calls.as_mut()?;
+        let chunking = &mut calls.chunking;
+        if chunking.is_empty() || !self.values.pace.is_open(now.monotonic) {
+            return None;
+        }
+        if values_wait && !std::mem::replace(&mut chunking.gave_way, true) {
+            return None;
+        }
+        chunking.gave_way = false;
+        let mut bytes = Vec::new();
+        let (topic, written) = chunking.write(most, &header, &mut bytes)?;
+        match written {
+            Ok(()) => {
+                self.values.pace.spend(bytes.len(), now.monotonic);
+                Some(Output::Action { topic, bytes })
+            }
+            Err(error) => {
+                self.count_call(topic, None, Reason::TooBig, || error.to_string());
+                None
+            }
+        }
+    }
+
+    /// Returns the next output for the port about calls, or the next request or response to send.
+    pub(in super::super) fn next_action(&mut self, now: Now) -> Option<Output> {
+        loop {
+            if let Some(chunk) = self.next_chunk(now) {
+                return Some(chunk);
+            }
+            let mut bytes = self.values.buffer();
+            match self.write_action(&mut bytes, now) {
+                Some(Told::Datagram(topic, _)) if bytes.len() <= self.most() => {
+                    return Some(Output::Action { topic, bytes });
+                }
+                Some(Told::Datagram(topic, of)) => self.cut_up(topic, of, bytes),
+                Some(Told::News(output)) => {
+                    self.values.recycle(bytes);
+                    return Some(output);
+                }
+                None => {
+                    self.values.recycle(bytes);
+                    return None;
+                }
+            }
+        }
+    }
+
+    fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
+        let header = self.values.action_header(now);
+        loop {
+            let calls = self.calls.as_mut()?;
+            if let Some(news) = calls.news.pop_front() {
+                return Some(Told::News(news));
+            }
+            if calls.due.is_none_or(|due| due > now.monotonic) {
+                return None;
+            }
+            let since = calls.since_start(now);
+            let answer = calls.responder.poll_transmit(since);
+            let answer =
+                answer.map(|(_, answer)| (Of::message(&answer), encode(&answer, &header, bytes)));
+            let next = answer.or_else(|| {
+                let request = calls.requestor.poll_transmit(since);
+                request.map(|request| (Of::message(&request), encode(&request, &header, bytes)))
+            });
+            match next {
+                // Timeouts that occurred in the meantime are output.
+                None => {
+                    self.settle(now);
+                    let calls = self.calls.as_mut()?;
+                    return calls.news.pop_front().map(Told::News);
+                }
+                Some((of, (Some(topic), Ok(())))) if !self.values.is_withheld(topic) => {
+                    return Some(Told::Datagram(topic, of));
+                }
+                Some((_, (Some(topic), Ok(())))) => {
+                    self.count_call(topic, None, (Reason::SpaceTaken, "withheld"), String::new);
+                }
+                Some((_, (topic, Err(error)))) => {
+                    if let Some(topic) = topic {
+                        self.count_call(topic, None, Reason::TooBig, || error.to_string());
+                    }
+                }
+                Some((_, (None, Ok(())))) => {}
+            }
+            bytes.clear();
+        }
+    }
+}
+
+/// The next output about calls.
+enum Told {
+    News(Output),
+    Datagram(TopicId, Of),
+}
+
+/// Encodes the NetworkMessage and returns the topic of its call.
+fn encode(
+    action: &ActionToSend<'_>,
+    header: &NetworkHeader<'_>,
+    bytes: &mut Vec<u8>,
+) -> (Option<TopicId>, Result<(), EncodeError>) {
+    let ActionAddress {
+        publisher_id,
+        writer_group_id,
+        writer_id,
+        ..
+    } = action.address;
+    let topic = match publisher_id.as_id() {
+        PublisherId::UInt16(space) => {
+            TopicId::new(space, writer_group_id.unwrap_or_default(), *writer_id)
+        }
+        PublisherId::Byte(_)
+        | PublisherId::UInt32(_)
+        | PublisherId::UInt64(_)
+        | PublisherId::String(_) => None,
+    };
+    let written = action
+        .encode(bytes, header, &Extras::default())
+        .and_then(uadp::action::ActionEncoder::finish);
+    (topic, written)
+}
