@@ -1,19 +1,30 @@
 //! Lists the peers in the ROS graph that the mapping needs and that are missing.
 
-use std::collections::BTreeMap;
 use std::net::IpAddr;
 
 use bridge_node::{Actions, AwaitedPeers, Executing, near};
 use mappings::{Mapping, ServiceRole, SpaceId};
 
-use super::Ros1Port;
-use super::actions::{served, server};
+use super::action_servers::{served, server};
+use super::side::Ros1Side;
+use super::sinks::Sinks;
+use super::sources::Sources;
 use crate::services::Executor;
 use crate::sink::Sink;
 use crate::source::Source;
 
-impl Ros1Port {
-    pub(super) fn add_missing(&self, missing: &mut AwaitedPeers) {
+/// The node and its topics, for the search of missing peers.
+pub(super) struct Missing<'p> {
+    pub(super) side: &'p Ros1Side,
+    /// The address of this node as other nodes see it; `None` if it is a host name.
+    pub(super) address: Option<IpAddr>,
+    pub(super) sources: &'p Sources,
+    pub(super) sinks: &'p Sinks,
+}
+
+impl Missing<'_> {
+    /// Adds the missing peers.
+    pub(super) fn add(&self, missing: &mut AwaitedPeers) {
         if let Some(address) = self.address.filter(|address| !is_local(*address)) {
             missing.add("other ROS nodes", || {
                 format!(
@@ -23,15 +34,15 @@ impl Ros1Port {
             });
         }
         // Without a master no peers are known; this is reported as not ready.
-        if !self.has_master {
+        if !self.side.has_master {
             return;
         }
-        for source in &self.sources {
+        for source in self.sources.iter() {
             self.add_publisher(source, missing);
         }
-        for (topic, sink) in &self.sinks {
+        for (topic, sink) in self.sinks.iter() {
             let is_named = sink.ros_topic != format!("/{topic}");
-            if is_named && self.policy.mapping().variable(*topic).is_some() {
+            if is_named && self.side.policy.mapping().variable(*topic).is_some() {
                 self.add_mistaken(sink, missing);
             }
             self.add_subscribers(sink, missing);
@@ -39,36 +50,14 @@ impl Ros1Port {
         self.add_servers(missing);
     }
 
-    /// Returns the nodes in `named` except this node.
-    fn others<'g>(
-        &self,
-        named: &'g BTreeMap<String, Vec<String>>,
-        name: &str,
-    ) -> impl Iterator<Item = &'g str> {
-        let nodes = named.get(name).into_iter().flatten().map(String::as_str);
-        let own = self.node.name().to_owned();
-        nodes.filter(move |node| *node != own)
-    }
-
-    /// Returns the names in `named` that another node has.
-    fn names<'g>(
-        &'g self,
-        named: &'g BTreeMap<String, Vec<String>>,
-    ) -> impl Iterator<Item = &'g str> {
-        let of_others = named
-            .iter()
-            .filter(|(_, nodes)| nodes.iter().any(|node| node != self.node.name()));
-        of_others.map(|(name, _)| name.as_str())
-    }
-
     /// Adds the publisher of a topic that the mapping subscribes to.
     fn add_publisher(&self, source: &Source, missing: &mut AwaitedPeers) {
         if source.found || source.values.is_empty() || source.is_live() {
             return;
         }
-        let (publishers, topic) = (&self.graph.publishers, source.ros_topic.as_str());
-        let Some(publisher) = self.others(publishers, topic).next() else {
-            let known = self.names(publishers);
+        let (publishers, topic) = (&self.side.graph.publishers, source.ros_topic.as_str());
+        let Some(publisher) = self.side.others(publishers, topic).next() else {
+            let known = self.side.names(publishers);
             missing.add_named(("topic", topic), "no publisher", known);
             return;
         };
@@ -93,20 +82,20 @@ impl Ros1Port {
     /// it or subscribes to a topic with a similar name.
     fn add_mistaken(&self, sink: &Sink, missing: &mut AwaitedPeers) {
         let topic = sink.ros_topic.as_str();
-        let subscribers = &self.graph.subscribers;
-        if self.others(subscribers, topic).next().is_some() {
+        let subscribers = &self.side.graph.subscribers;
+        if self.side.others(subscribers, topic).next().is_some() {
             return;
         }
         let peer = format!("subscriber of {topic}");
-        if let Some(publisher) = self.others(&self.graph.publishers, topic).next() {
+        if let Some(publisher) = self.side.others(&self.side.graph.publishers, topic).next() {
             missing.add(peer, || {
                 format!(
                     "no node subscribes to it, and {publisher} publishes it too; if {publisher} produces \
                      the value, set its `origin` to {}",
-                    self.policy.own()
+                    self.side.policy.own()
                 )
             });
-        } else if let Some(near) = near(topic, self.names(subscribers)) {
+        } else if let Some(near) = near(topic, self.side.names(subscribers)) {
             missing.add(peer, || format!("no subscriber; did you mean {near}?"));
         }
     }
@@ -116,7 +105,9 @@ impl Ros1Port {
     fn add_subscribers(&self, sink: &Sink, missing: &mut AwaitedPeers) {
         let Some(open) = &sink.open else { return };
         let publisher = &open.publisher;
-        let others = self.others(&self.graph.subscribers, publisher.topic());
+        let others = self
+            .side
+            .others(&self.side.graph.subscribers, publisher.topic());
         for node in others.filter(|node| !publisher.is_subscribed_by(node)) {
             missing.add(format!("subscriber {node}"), || {
                 if let Some(refused) = publisher.refused_type() {
@@ -135,7 +126,7 @@ impl Ros1Port {
                 format!(
                     "it cannot reach {} (set ROS_IP to an address that it can reach), or it has died \
                      (remove it with `rosnode cleanup`)",
-                    self.node.uri()
+                    self.side.node.uri()
                 )
             });
         }
@@ -143,17 +134,17 @@ impl Ros1Port {
 
     /// Adds the services and actions that the mapping calls and no node serves.
     fn add_servers(&self, missing: &mut AwaitedPeers) {
-        let (mapping, services) = (self.policy.mapping(), &self.graph.services);
-        let executed = Executing::<Executor>::mapped(mapping, &self.policy).into_iter();
-        for service in executed.chain(called(mapping, self.policy.own())) {
-            if self.others(services, service).next().is_none() {
-                let known = self.names(services);
+        let (mapping, services) = (self.side.policy.mapping(), &self.side.graph.services);
+        let executed = Executing::<Executor>::mapped(mapping, &self.side.policy).into_iter();
+        for service in executed.chain(called(mapping, self.side.policy.own())) {
+            if self.side.others(services, service).next().is_none() {
+                let known = self.side.names(services);
                 missing.add_named(("service", service), "no server", known);
             }
         }
-        for action in Actions::mapped(mapping, &self.policy) {
-            if server(&self.graph, self.node.name(), action).is_none() {
-                let known = served(&self.graph, self.node.name());
+        for action in Actions::mapped(mapping, &self.side.policy) {
+            if server(&self.side.graph, self.side.node.name(), action).is_none() {
+                let known = served(&self.side.graph, self.side.node.name());
                 missing.add_named(("action", action), "no server", known);
             }
         }

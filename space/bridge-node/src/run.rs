@@ -2,6 +2,7 @@
 
 mod awaited;
 mod calls;
+mod fixed;
 mod network;
 mod outbox;
 mod redundancy;
@@ -17,7 +18,7 @@ use std::time::{Duration, Instant};
 
 use bridge_core::{Handover, Heard, Notice, Output, Owned, Reason, Router};
 use bytes::Bytes;
-use mappings::{Mapping, PubSub, SpaceId, TopicId};
+use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, Sleep};
 use tracing::{debug, info, warn};
@@ -38,6 +39,7 @@ use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, RedundancyStatus, Status};
 use crate::tap::Taps;
 
+pub(crate) use fixed::Fixed;
 pub(crate) use outbox::Outbox;
 use outbox::Parcel;
 
@@ -108,46 +110,6 @@ enum Phase {
     Running,
     /// Only pending cancellations are awaited.
     Closing,
-}
-
-/// Settings of the mapping that are fixed at the start of the program.
-#[derive(Debug)]
-pub(crate) struct Fixed {
-    pub(crate) started: Arc<Mapping>,
-    /// The mapping that was adopted last.
-    pub(crate) taken: Arc<Mapping>,
-    /// Whether the mapping sets the address; else the command line does.
-    pub(crate) address: bool,
-    /// Whether the mapping sets the interface; else the command line does.
-    pub(crate) interface: bool,
-}
-
-impl Fixed {
-    /// Returns the keys of `mapping` that differ from the running settings.
-    fn differing(&self, mapping: &Mapping) -> Vec<String> {
-        let (was, is) = (self.started.pubsub(), mapping.pubsub());
-        let media = |of: &PubSub| -> Vec<_> {
-            let carriers = of.carriers.iter();
-            carriers.map(|carrier| carrier.medium.clone()).collect()
-        };
-        let listed = (media(was), media(is));
-        let is_listed = !(listed.0.is_empty() && listed.1.is_empty());
-        if is_listed && self.address {
-            let differs = listed.0 != listed.1;
-            return differs.then(|| "pubsub".to_owned()).into_iter().collect();
-        }
-        let keys = [
-            ("pubsub.address", self.address && was.address != is.address),
-            (
-                "pubsub.interface",
-                self.interface && was.interface != is.interface,
-            ),
-            ("pubsub.ttl", was.ttl != is.ttl),
-            ("pubsub.mqtt", was.broker != is.broker),
-        ];
-        let differing = keys.into_iter().filter(|(_, differs)| *differs);
-        differing.map(|(key, _)| key.to_owned()).collect()
-    }
 }
 
 impl<P: Port> Shell<P> {

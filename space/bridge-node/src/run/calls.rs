@@ -17,10 +17,6 @@ use crate::port::{Execution, Port, PortEvent};
 impl<P: Port> Shell<P> {
     /// Handles the events of the port that concern calls, and values that the port describes
     /// itself.
-    #[expect(
-        clippy::wildcard_enum_match_arm,
-        reason = "the caller handles all other outputs"
-    )]
     pub(super) fn call_event(&mut self, event: PortEvent) {
         match event {
             PortEvent::Described { topic, description } => {
@@ -56,7 +52,18 @@ impl<P: Port> Shell<P> {
             PortEvent::Executed { execution, outcome } => {
                 self.router.executed(execution, outcome, now());
             }
-            _ => {}
+            // The caller handles them.
+            PortEvent::Sample { .. }
+            | PortEvent::Qualified { .. }
+            | PortEvent::Bound { .. }
+            | PortEvent::Unbound { .. }
+            | PortEvent::Left { .. }
+            | PortEvent::Live { .. }
+            | PortEvent::Lost { .. }
+            | PortEvent::Dropped { .. }
+            | PortEvent::Unmatched { .. }
+            | PortEvent::CallFailed { .. }
+            | PortEvent::Ended(_) => {}
         }
     }
 

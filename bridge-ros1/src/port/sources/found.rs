@@ -6,21 +6,26 @@
 
 use std::collections::HashSet;
 use std::ops::Bound;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use bridge_node::PortEvent;
 use bridge_node::policy::{Found, MAX_TOPICS};
 use mappings::TopicId;
 use messages::{Selection, TypeName};
 use tracing::warn;
 
-use super::Ros1Port;
+use super::super::side::Ros1Side;
+use super::{Refused, Sources};
 use crate::source::Source;
 
-impl Ros1Port {
+impl Sources {
     /// Subscribes to published topics with a name of this space or of a pattern, and removes topics
-    /// that are not published.
-    pub(super) fn find_sources(&mut self) {
+    /// that are not published. `written_topics` returns the topics to which values of other spaces
+    /// are written.
+    pub(in crate::port) fn find(
+        &mut self,
+        side: &mut Ros1Side,
+        written_topics: impl Fn(&Ros1Side) -> HashSet<String>,
+    ) {
         let mut found = Vec::new();
         let mut written = None;
         self.refused.topics = 0;
@@ -28,11 +33,11 @@ impl Ros1Port {
         // the limit.
         let after = (Bound::Excluded(self.taken_last.clone()), Bound::Unbounded);
         let before = ..=self.taken_last.clone();
-        let publishers = &self.graph.publishers;
+        let publishers = &side.graph.publishers;
         let topics = publishers.range(after).chain(publishers.range(before));
         for (ros_topic, publishers) in topics {
-            if self.source_of.contains_key(ros_topic)
-                || publishers.iter().all(|name| name == self.node.name())
+            if self.by_name.contains_key(ros_topic)
+                || publishers.iter().all(|name| name == side.node.name())
             {
                 continue;
             }
@@ -40,14 +45,14 @@ impl Ros1Port {
                 self.refused.topics += 1;
                 continue;
             }
-            let typed = self.graph.types.get(ros_topic).and_then(|t| t.parse().ok());
-            let made = match self.policy.found(ros_topic, typed.as_ref()) {
+            let typed = side.graph.types.get(ros_topic).and_then(|t| t.parse().ok());
+            let made = match side.policy.found(ros_topic, typed.as_ref()) {
                 Found::Named(topic) => Ok((topic, None, Selection::Whole)),
                 // Other publishers of topics to which values of other spaces are written do not
                 // produce values of this space.
                 Found::Made(_) | Found::Fault(_)
                     if written
-                        .get_or_insert_with(|| self.written())
+                        .get_or_insert_with(|| written_topics(side))
                         .contains(ros_topic) =>
                 {
                     continue;
@@ -61,18 +66,18 @@ impl Ros1Port {
         let mut places = self.places();
         for (ros_topic, made) in found {
             match made {
-                Ok(value) => self.add_found(ros_topic, value, &mut places),
+                Ok(value) => self.add_found(side, ros_topic, value, &mut places),
                 Err(fault) => {
-                    self.policy.told.once(&ros_topic, "pattern", || fault);
+                    side.policy.told.once(&ros_topic, "pattern", || fault);
                 }
             }
         }
         // Known topics may have lost their subscription.
-        for index in 0..self.sources.len() {
-            self.resubscribe(index);
+        for index in 0..self.list.len() {
+            self.resubscribe(side, index);
         }
-        for source in &mut self.sources {
-            let published = self.graph.publishers.contains_key(&source.ros_topic);
+        for source in &mut self.list {
+            let published = side.graph.publishers.contains_key(&source.ros_topic);
             let connected = source
                 .subscription
                 .as_ref()
@@ -84,52 +89,29 @@ impl Ros1Port {
         }
     }
 
-    /// Returns the topics to which values of other spaces are written.
-    fn written(&self) -> HashSet<String> {
-        let sinks = self.sinks.values();
-        sinks
-            .filter_map(|sink| self.node.resolve(&sink.ros_topic).ok())
-            .collect()
-    }
-
     /// Subscribes to a topic without a subscription, if another node publishes it.
-    pub(super) fn resubscribe(&mut self, index: usize) {
+    fn resubscribe(&mut self, side: &mut Ros1Side, index: usize) {
         let lost = |s: &&Source| s.subscription.is_none() && !s.values.is_empty();
-        let Some(source) = self.sources.get(index).filter(lost) else {
+        let Some(source) = self.list.get(index).filter(lost) else {
             return;
         };
-        let publishers = self.graph.publishers.get(&source.ros_topic);
-        let others = |names: &Vec<String>| names.iter().any(|name| name != self.node.name());
+        let publishers = side.graph.publishers.get(&source.ros_topic);
+        let others = |names: &Vec<String>| names.iter().any(|name| name != side.node.name());
         if !publishers.is_some_and(others) {
             return;
         }
         let ros_topic = source.ros_topic.clone();
-        if let Err(error) = self.subscribe(index) {
-            self.policy
+        if let Err(error) = self.subscribe(side, index) {
+            side.policy
                 .told
                 .once(&ros_topic, "not subscribed", || error.to_string());
         }
     }
 
-    /// Removes a source; its index may be reused.
-    pub(super) fn vacate(&mut self, index: usize) {
-        let Some(place) = self.sources.get_mut(index) else {
-            return;
-        };
-        // Messages queued for the source do not come out of the inbox any more.
-        let source = std::mem::replace(place, Source::vacant());
-        self.source_of.remove(&source.ros_topic);
-        self.vacant.push(index);
-        // A source that was never bound is not reported as unbound.
-        let gone = source.values.into_iter().filter(|_| source.bound.is_some());
-        let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
-        self.events.extend(gone);
-    }
-
     /// Returns the room for topics that the mapping does not name.
-    pub(super) fn places(&self) -> Places {
-        let found = self.sources.iter().filter(|source| source.found);
-        let places = self.sources.iter().enumerate();
+    fn places(&self) -> Places {
+        let found = self.list.iter().filter(|source| source.found);
+        let places = self.list.iter().enumerate();
         let silent = places.filter(|(_, source)| source.gives_way());
         Places {
             free: MAX_TOPICS.saturating_sub(found.count()),
@@ -139,8 +121,9 @@ impl Ros1Port {
 
     /// Adds a topic that the mapping does not name, unless the limit is reached or another topic
     /// already produces the value.
-    pub(super) fn add_found(
+    fn add_found(
         &mut self,
+        side: &mut Ros1Side,
         ros_topic: String,
         (topic, expected, selection): (TopicId, Option<TypeName>, Selection),
         places: &mut Places,
@@ -150,27 +133,27 @@ impl Ros1Port {
                 self.refused.topics += 1;
                 return;
             };
-            self.vacate(silent);
+            self.vacate(side, silent);
             places.free += 1;
         }
         let same = |source: &&Source| source.values.iter().any(|(other, _)| *other == topic);
-        if let Some(other) = self.sources.iter().find(same) {
+        if let Some(other) = self.list.iter().find(same) {
             let other = other.ros_topic.clone();
-            self.policy.tell_same(&ros_topic, topic, &other);
+            side.policy.tell_same(&ros_topic, topic, &other);
             return;
         }
         self.taken_last.clone_from(&ros_topic);
         let index = self.source(ros_topic, expected);
-        if let Some(source) = self.sources.get_mut(index) {
+        if let Some(source) = self.list.get_mut(index) {
             source.values.push((topic, selection));
             source.found = true;
             places.free -= 1;
         }
-        self.resubscribe(index);
+        self.resubscribe(side, index);
     }
 
     /// Logs refused topics, at first immediately and then every minute.
-    pub(super) fn tell_refused(&mut self) {
+    pub(in crate::port) fn tell_refused(&mut self) {
         let Refused { topics, told } = self.refused;
         let now = bridge_node::now().monotonic;
         let due = told.is_none_or(|told| now.duration_since(told) >= REFUSED_AGAIN);
@@ -188,17 +171,10 @@ impl Ros1Port {
 
 /// Room for topics that the mapping does not name.
 #[derive(Debug)]
-pub(super) struct Places {
+struct Places {
     free: usize,
     /// Sources that give way if there is no free room.
     silent: Vec<usize>,
-}
-
-/// The refused topics.
-#[derive(Debug, Default)]
-pub(super) struct Refused {
-    pub(super) topics: usize,
-    told: Option<Instant>,
 }
 
 /// Maximum length of the name of such a topic, in bytes.
@@ -215,7 +191,7 @@ mod tests {
     use tcpros::{Graph, NodeOptions};
 
     use super::*;
-    use crate::port::PortOptions;
+    use crate::port::{PortOptions, Ros1Port};
 
     fn port(mapping: &str) -> Ros1Port {
         let mut node = NodeOptions::from_env("n");
@@ -256,28 +232,31 @@ mod tests {
     async fn topics_that_nobody_publishes_any_more_leave_their_place_to_a_new_one() {
         let mut port = port("");
         port.look(graph(5000, false));
-        assert_eq!(port.source_of.len(), MAX_TOPICS);
-        assert_eq!(port.refused.topics, 5000 - MAX_TOPICS);
-        assert!(port.refused.told.is_some(), "the operator is told");
+        assert_eq!(port.sources.by_name.len(), MAX_TOPICS);
+        assert_eq!(port.sources.refused.topics, 5000 - MAX_TOPICS);
+        assert!(port.sources.refused.told.is_some(), "the operator is told");
         // The topics leave the graph, and the next comparison detects it.
         port.look(graph(0, true));
         port.look(graph(0, true));
-        assert!(port.source_of.contains_key(HONEST));
-        assert_eq!((port.sources.len(), port.refused.topics), (MAX_TOPICS, 0));
+        assert!(port.sources.by_name.contains_key(HONEST));
+        assert_eq!(
+            (port.sources.list.len(), port.sources.refused.topics),
+            (MAX_TOPICS, 0)
+        );
     }
 
     #[tokio::test]
     async fn topics_that_only_the_master_says_are_published_give_way_in_turn() {
         let mut port = port("");
         let mut looks = 0;
-        while !port.source_of.contains_key(HONEST) {
+        while !port.sources.by_name.contains_key(HONEST) {
             port.look(graph(6000, true));
-            assert!(port.source_of.len() <= MAX_TOPICS);
+            assert!(port.sources.by_name.len() <= MAX_TOPICS);
             looks += 1;
             // Each turn takes ten seconds, and 6000 topics take two turns.
             assert!(looks <= 50, "it never has its turn");
         }
-        assert_eq!(port.sources.len(), MAX_TOPICS);
+        assert_eq!(port.sources.list.len(), MAX_TOPICS);
     }
 
     const MAPPED: &str = "
@@ -293,6 +272,6 @@ variables:
         port.look(graph(5000, false));
         let mapping = Mapping::from_yaml(MAPPED, "cell.yaml").mapping.unwrap();
         port.reload(&Arc::new(mapping), &Arc::default());
-        assert!(port.source_of.contains_key("/turn"));
+        assert!(port.sources.by_name.contains_key("/turn"));
     }
 }

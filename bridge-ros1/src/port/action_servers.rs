@@ -1,90 +1,7 @@
-//! Offers actions of other spaces as action servers of the graph, and executes action servers of
-//! the graph for other spaces.
+//! The action servers of the graph: nodes with the topics of an action.
 
-use std::sync::Arc;
-
-use bridge_node::{Actions, Present};
-use mappings::TopicId;
 use messages::TypeName;
 use tcpros::Graph;
-
-use super::Ros1Port;
-use super::calls::is_redundant_peer;
-use crate::services::Ros1Graph;
-
-impl Ros1Port {
-    /// Offers the known actions. An action under a name from the mapping gives way to an action
-    /// server of another node, because both servers would take each goal.
-    pub(super) fn offer_actions(&mut self) {
-        let (graph, own) = (&self.graph, self.node.name());
-        let is_redundant = self.is_redundant;
-        let is_other = |node: &str| node != own && !(is_redundant && is_redundant_peer(own, node));
-        let other = |action: &str| server_of(graph, is_other, action);
-        let is_chosen = |topic: TopicId, action: &str| action != format!("/{topic}");
-        for (topic, action) in self.actions.chosen(&self.policy) {
-            if let Some(node) = other(&action) {
-                self.policy.told.once(&action, "taken", || {
-                    format!(
-                        "{topic} is not offered as {action}: the node {node} already serves this action; \
-                         use another name, or stop the node"
-                    )
-                });
-            }
-        }
-        let left =
-            |topic: TopicId, action: &str| is_chosen(topic, action) && other(action).is_some();
-        self.actions.leave(left);
-        if !self.actions.is_waiting() {
-            return;
-        }
-        let mut ros = Ros1Graph {
-            node: &self.node,
-            definitions: &mut self.definitions,
-            ends: &mut self.ends,
-        };
-        // The owners of names are known once the master has responded.
-        let has_master = self.has_master;
-        let may = |topic: TopicId, action: &str| {
-            !left(topic, action) && (has_master || !is_chosen(topic, action))
-        };
-        let calls = &self.calls;
-        let asker = |topic| calls.asker(topic);
-        let policy = &mut self.policy;
-        let events = self
-            .actions
-            .offer_waiting((&mut ros, policy), asker, may, usize::MAX);
-        self.events.extend(events);
-    }
-
-    /// Offers the action servers of other nodes that are actions of this space, and withdraws
-    /// actions of lost servers.
-    pub(super) fn find_actions(&mut self) {
-        let mapping = Arc::clone(self.policy.mapping());
-        let mapped = Actions::mapped(&mapping, &self.policy);
-        let (graph, own) = (&self.graph, self.node.name());
-        let mut present = Present::new();
-        for topic in graph.subscribers.keys() {
-            let Some(action) = topic.strip_suffix("/goal") else {
-                continue;
-            };
-            let wanted = mapped.contains(action) || Actions::is_named(&self.policy, action);
-            if action.len() > MAX_NAME || !wanted || server(graph, own, action).is_none() {
-                continue;
-            }
-            present.insert(action.to_owned(), type_of(graph, action));
-        }
-        let mut ros = Ros1Graph {
-            node: &self.node,
-            definitions: &mut self.definitions,
-            ends: &mut self.ends,
-        };
-        let policy = &mut self.policy;
-        let events = self
-            .actions
-            .reconcile(&mut ros, policy, (&present, usize::MAX));
-        self.events.extend(events);
-    }
-}
 
 /// Returns the actions that nodes other than `own` serve.
 pub(super) fn served<'g>(graph: &'g Graph, own: &str) -> impl Iterator<Item = &'g str> {
@@ -99,7 +16,8 @@ pub(super) fn server<'g>(graph: &'g Graph, own: &str, action: &str) -> Option<&'
     server_of(graph, |node| node != own, action)
 }
 
-fn server_of<'g>(
+/// Returns a node for which `is_other` holds and that serves the action.
+pub(super) fn server_of<'g>(
     graph: &'g Graph,
     is_other: impl Fn(&str) -> bool,
     action: &str,
@@ -120,7 +38,7 @@ fn server_of<'g>(
 
 /// Returns the type of an action from the types of its topics, as far as the master knows them. The
 /// master has the type `*` for a topic without publishers that is subscribed with any type.
-fn type_of(graph: &Graph, action: &str) -> Option<TypeName> {
+pub(super) fn type_of(graph: &Graph, action: &str) -> Option<TypeName> {
     let parts = [
         ("goal", "ActionGoal"),
         ("result", "ActionResult"),
@@ -131,9 +49,6 @@ fn type_of(graph: &Graph, action: &str) -> Option<TypeName> {
         named.strip_suffix(ending)?.parse().ok()
     })
 }
-
-/// Maximum length of a name, in bytes.
-const MAX_NAME: usize = 255;
 
 #[cfg(test)]
 mod tests {
