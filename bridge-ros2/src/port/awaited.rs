@@ -1,23 +1,38 @@
 //! Lists the peers in the DDS domain that the mapping needs and that are missing.
 
 use std::collections::BTreeSet;
+use std::net::IpAddr;
 
 use bridge_node::{Actions, AwaitedPeers, Executing, near};
 use mappings::ServiceRole;
 use ros2_node::graph::{Endpoint, ros_topic};
+use ros2_node::service::ServicePeers;
 use tokio::time::Instant;
 
-use super::Ros2Port;
 use super::services::Client;
+use super::side::Ros2Side;
+use super::sinks::Sinks;
+use super::sources::Sources;
 use crate::sink::Sink;
 use crate::source::Source;
 
-impl Ros2Port {
-    pub(super) fn add_missing(&self, missing: &mut AwaitedPeers) {
-        let bridges = self.graph.bridges().count();
-        if self.graph.participants().len() <= bridges {
-            missing.add(format!("nodes in DDS domain {}", self.domain_id), || {
-                let networks = match self.networks.as_slice() {
+/// The node and its topics, for the search of missing peers.
+pub(super) struct Missing<'p> {
+    pub(super) side: &'p Ros2Side,
+    pub(super) sources: &'p Sources,
+    pub(super) sinks: &'p Sinks,
+    pub(super) peers: &'p ServicePeers,
+    /// The addresses to which RustDDS binds its sockets; empty means all addresses.
+    pub(super) networks: &'p [IpAddr],
+}
+
+impl Missing<'_> {
+    /// Adds the missing peers.
+    pub(super) fn add(&self, missing: &mut AwaitedPeers) {
+        let bridges = self.side.graph.bridges().count();
+        if self.side.graph.participants().len() <= bridges {
+            missing.add(format!("nodes in DDS domain {}", self.side.domain_id), || {
+                let networks = match self.networks {
                     [] => "all interfaces".to_owned(),
                     networks => {
                         let networks: Vec<String> = networks.iter().map(ToString::to_string).collect();
@@ -31,13 +46,13 @@ impl Ros2Port {
             });
             return;
         }
-        for source in &self.sources {
+        for source in self.sources.iter() {
             self.add_publisher(source, missing);
         }
-        for (topic, sink) in &self.sinks {
+        for (topic, sink) in self.sinks.iter() {
             let name = ros_topic(&sink.dds_topic);
             if name != Some(topic.to_string().as_str())
-                && self.policy.mapping().variable(*topic).is_some()
+                && self.side.policy.mapping().variable(*topic).is_some()
             {
                 self.add_mistaken(sink, missing);
             }
@@ -47,7 +62,7 @@ impl Ros2Port {
 
     /// Adds the publisher of a topic that the mapping reads.
     fn add_publisher(&self, source: &Source, missing: &mut AwaitedPeers) {
-        let mapping = self.policy.mapping();
+        let mapping = self.side.policy.mapping();
         let mut values = source.values.iter();
         if source.live || !values.any(|(topic, _)| mapping.variable(*topic).is_some()) {
             return;
@@ -55,10 +70,10 @@ impl Ros2Port {
         let Some(name) = ros_topic(&source.dds_topic) else {
             return;
         };
-        let writers = self.graph.writers(&source.dds_topic);
+        let writers = self.side.graph.writers(&source.dds_topic);
         let dds_type = source.message_type.dds();
         if writers.is_empty() {
-            let known = self.graph.written_topics().filter_map(ros_topic);
+            let known = self.side.graph.written_topics().filter_map(ros_topic);
             add_topic(("topic", name), "no publisher", known, missing);
         } else {
             missing.add(format!("topic /{name}"), || {
@@ -79,30 +94,30 @@ impl Ros2Port {
         let Some(name) = ros_topic(&sink.dds_topic) else {
             return;
         };
-        if !self.graph.readers(&sink.dds_topic).is_empty() {
+        if !self.side.graph.readers(&sink.dds_topic).is_empty() {
             return;
         }
         let peer = format!("subscriber of /{name}");
-        if let Some(writer) = self.graph.writers(&sink.dds_topic).first() {
+        if let Some(writer) = self.side.graph.writers(&sink.dds_topic).first() {
             missing.add(peer, || {
-                let owner = self.domain.owner(writer.guid);
+                let owner = self.side.domain.owner(writer.guid);
                 format!(
                     "no node subscribes to it, and {} publishes it too; if that node produces the value, \
                      set its `origin` to {}",
                     owner.as_deref().unwrap_or("an unnamed node"),
-                    self.policy.own()
+                    self.side.policy.own()
                 )
             });
-        } else if let Some(near) = near(name, self.graph.read_topics().filter_map(ros_topic)) {
+        } else if let Some(near) = near(name, self.side.graph.read_topics().filter_map(ros_topic)) {
             missing.add(peer, || format!("no subscriber; did you mean /{near}?"));
         }
     }
 
     /// Adds the services and actions that the mapping calls and no node serves.
     fn add_servers(&self, missing: &mut AwaitedPeers) {
-        let mapping = self.policy.mapping();
-        let services = Executing::<Client>::mapped(mapping, &self.policy);
-        let called = mapping.services(self.policy.own());
+        let mapping = self.side.policy.mapping();
+        let services = Executing::<Client>::mapped(mapping, &self.side.policy);
+        let called = mapping.services(self.side.policy.own());
         let called = called.filter_map(|(_, binding)| match &binding.role {
             ServiceRole::Call { service, .. } | ServiceRole::Poll { service, .. } => {
                 Some(service.as_str())
@@ -110,7 +125,7 @@ impl Ros2Port {
             ServiceRole::Answer { .. } => None,
         });
         let services: Vec<&str> = services.into_iter().chain(called).collect();
-        let actions = Actions::mapped(mapping, &self.policy);
+        let actions = Actions::mapped(mapping, &self.side.policy);
         if services.is_empty() && actions.is_empty() {
             return;
         }
@@ -126,7 +141,7 @@ impl Ros2Port {
         &self,
         served: impl Iterator<Item = (&'s str, &'s [Endpoint])>,
     ) -> BTreeSet<&'s str> {
-        let is_node = |one: &Endpoint| !self.graph.is_bridge(one.guid);
+        let is_node = |one: &Endpoint| !self.side.graph.is_bridge(one.guid);
         let of_nodes = served.filter(|(_, servers)| servers.iter().any(is_node));
         of_nodes.map(|(name, _)| name).collect()
     }

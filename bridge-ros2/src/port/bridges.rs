@@ -8,9 +8,9 @@ use ros2_node::graph::{Graph, bridge_topic};
 use ros2_node::node::ParticipantPrefix;
 use rustdds::GUID;
 
-use super::Ros2Port;
+use super::side::Ros2Side;
 
-impl Ros2Port {
+impl Ros2Side {
     /// Returns whether another bridge serves the space in this domain. Any participant can announce
     /// a space; the announcement is ignored if the mapping has the space in another domain.
     pub(super) fn is_at_home(&self, space: SpaceId) -> bool {

@@ -4,9 +4,6 @@ use std::collections::BTreeMap;
 
 use bridge_core::Reason;
 use bridge_node::PortEvent;
-use ros2_node::service::{ServiceCounters, ServiceServer};
-
-use super::Ros2Port;
 
 /// The reported counts, by reason and cause.
 #[derive(Debug, Default)]
@@ -14,7 +11,7 @@ pub(super) struct Drops(BTreeMap<(&'static str, &'static str), u64>);
 
 impl Drops {
     /// Returns the increases above the reported counts.
-    fn since(
+    pub(super) fn since(
         &mut self,
         totals: impl IntoIterator<Item = (Reason, &'static str, u64)>,
     ) -> Vec<PortEvent> {
@@ -29,45 +26,6 @@ impl Drops {
             }
         }
         events
-    }
-}
-
-impl Ros2Port {
-    /// Reports the drops after the last report.
-    pub(super) fn report_drops(&mut self) {
-        let served = self.parameters.counters().plus(self.told_types.counters());
-        let calls = self.calls.servers().map(ServiceServer::counters);
-        let calls = calls.fold(ServiceCounters::default(), ServiceCounters::plus);
-        let totals = [
-            (Reason::Malformed, "request of a call", calls.malformed),
-            (
-                Reason::CallFailed,
-                "call without a response",
-                calls.failures,
-            ),
-            (Reason::Overflow, "request of a call", calls.overflowed),
-            (
-                Reason::NotPublished,
-                "response to a call",
-                calls.undelivered,
-            ),
-            (
-                Reason::Malformed,
-                "list of nodes",
-                self.domain.malformed_lists(),
-            ),
-            (Reason::Malformed, "clock", self.clock.malformed()),
-            (Reason::Malformed, "service request", served.malformed),
-            // Services of the bridge fail only at a request that they cannot decode.
-            (
-                Reason::Malformed,
-                "body of a service request",
-                served.failures,
-            ),
-            (Reason::Overflow, "service request", served.overflowed),
-            (Reason::NotPublished, "service reply", served.undelivered),
-        ];
-        self.events.extend(self.drops.since(totals));
     }
 }
 
