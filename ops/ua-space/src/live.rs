@@ -8,6 +8,7 @@ pub(crate) mod book;
 mod call;
 mod carrier;
 pub(crate) mod channels;
+mod copies;
 pub(crate) mod described;
 mod echo;
 mod list;

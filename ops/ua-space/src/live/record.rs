@@ -18,7 +18,7 @@ use transport::{Received, Senders};
 
 use self::packets::Packets;
 use self::sink::Sink;
-use self::values::Values;
+use self::values::{Added, Values};
 use super::book::{Kind, News};
 use super::channels::{DESCRIBED_WITHIN, is_value};
 use super::list::{FIRST_ASKED, json};
@@ -240,8 +240,9 @@ impl Recording {
                         }
                     };
                     match recorded {
-                        Ok(true) => added += 1,
-                        Ok(false) => dropped += 1,
+                        Ok(Added::Value) => added += 1,
+                        Ok(Added::Copy) => {}
+                        Ok(Added::Dropped) => dropped += 1,
                         Err(failure) => fault = Some(failure),
                     }
                     Go::On

@@ -20,6 +20,7 @@ use self::assets::Assets;
 use self::hub::{Hub, Publication};
 use super::book::{Kind, News};
 use super::channels::{Channels, Unfit, is_value};
+use super::copies::Copies;
 use super::robot::Model;
 use super::{Go, in_group, until, utc};
 use crate::arguments::Viewers;
@@ -45,6 +46,7 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
         let hub = Arc::new(Hub::new(live.group(), assets));
         let start = live.start_utc();
         let mut channels = Channels::new();
+        let mut copies = Copies::default();
         for source in &arguments.models.model {
             let model = source.load().await?;
             offer(&model, (&mut channels, &hub), utc(start, live.now()));
@@ -57,7 +59,13 @@ pub(crate) fn serve(arguments: &Viewers) -> Result<(), Failure> {
         writeln!(io::stdout(), "{} at ws://{address}", live.group())?;
         let end = until(live.now(), arguments.seconds);
         let mut each = |news: News<'_>, now: Duration| {
-            take(&news, (&mut channels, &hub), (start, now));
+            let is_copy = match &news {
+                News::Sample(sample) => copies.is_copy(sample, now),
+                News::Announced { .. } | News::Response(..) => false,
+            };
+            if !is_copy {
+                take(&news, (&mut channels, &hub), (start, now));
+            }
             Go::On
         };
         let ended = live.listen(end, &mut each).await;

@@ -17,6 +17,7 @@ use crate::exit::Failure;
 use crate::live::announcements::Announcements;
 use crate::live::book::Sample;
 use crate::live::channels::{Channel, Channels, DESCRIBED_WITHIN, Unfit};
+use crate::live::copies::Copies;
 use crate::live::described::Described;
 use crate::live::robot::Model;
 use crate::report::warn;
@@ -26,6 +27,7 @@ pub(super) struct Values {
     sink: Sink,
     writer: Mcap,
     channels: Channels,
+    copies: Copies,
     /// Ids of the channels in the file.
     written: BTreeSet<u16>,
     /// Bytes that are not handed over to the disk.
@@ -38,6 +40,16 @@ pub(super) struct Values {
     weight: usize,
     left_out: BTreeMap<Unfit, u64>,
     scratch: Vec<u8>,
+}
+
+/// The outcome of a value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Added {
+    Value,
+    /// The same event is in the recording.
+    Copy,
+    /// The disk is too slow.
+    Dropped,
 }
 
 /// A value that waits for the description of its topic.
@@ -65,6 +77,7 @@ impl Values {
             sink,
             writer,
             channels: Channels::new(),
+            copies: Copies::default(),
             written: BTreeSet::new(),
             part,
             waiting: VecDeque::new(),
@@ -92,15 +105,17 @@ impl Values {
         });
     }
 
-    /// Adds a value that arrived at `now`; `time` is the same time since 1970. Returns false if the
-    /// value is dropped because the disk is too slow.
+    /// Adds a value that arrived at `now`; `time` is the same time since 1970.
     pub(super) fn add(
         &mut self,
         sample: &Sample<'_>,
         (now, time): (Duration, i128),
-    ) -> Result<bool, Failure> {
+    ) -> Result<Added, Failure> {
         if self.writer.waiting() >= CHUNK && !self.flush()? {
-            return Ok(false);
+            return Ok(Added::Dropped);
+        }
+        if self.copies.is_copy(sample, now) {
+            return Ok(Added::Copy);
         }
         let times = Times::of(sample, time);
         let described = sample.described.as_ref();
@@ -112,7 +127,7 @@ impl Values {
             Err(Unfit::Undescribed) => self.hold(sample, times, now),
             Err(unfit) => self.leave_out(unfit),
         }
-        Ok(true)
+        Ok(Added::Value)
     }
 
     /// Keeps the announcement of a topic, and records the values that wait for it.
