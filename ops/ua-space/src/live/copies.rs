@@ -49,7 +49,8 @@ impl Copies {
         let is_known = self.last.get(&topic).is_some_and(|last| {
             last.identity == identity && now.saturating_sub(last.first) <= COPIES_WITHIN
         });
-        if !is_known {
+        let has_room = self.last.len() < MOST_TOPICS || self.last.contains_key(&topic);
+        if !is_known && has_room {
             let first = now;
             self.last.insert(topic, Last { identity, first });
         }
@@ -59,6 +60,8 @@ impl Copies {
 
 /// Copies of an event are sent within 100 ms; states are repeated after 500 ms or more.
 const COPIES_WITHIN: Duration = Duration::from_millis(300);
+/// Maximum number of topics; of further topics each copy counts as a value.
+const MOST_TOPICS: usize = 65_536;
 
 #[cfg(test)]
 mod tests {
