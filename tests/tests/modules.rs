@@ -513,7 +513,8 @@ fn a_module_of_mtppy_runs_and_its_state_machine_is_ours() {
         .iter()
         .map(|state| format!("{state} Complete"))
         .collect();
-    (others.sort(), more.sort());
+    others.sort();
+    more.sort();
     assert_eq!(others, more);
 
     let endpoint = "opc.tcp://127.0.0.1:4840";
