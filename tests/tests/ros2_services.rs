@@ -148,10 +148,10 @@ async fn a_client_finds_a_killed_server_again_even_as_one_of_another_vendor() {
     for vendor in [Vendor::Cyclone, Vendor::FastDds, Vendor::Cyclone] {
         let server = vendor.serves(&cell, GRIP);
         // Until the lease of a killed server ends, a call may go to it alone.
-        let deadline = tokio::time::Instant::now() + SOON;
+        let deadline = Instant::now() + SOON;
         while let Err(error) = client.call(set(true)).await {
             assert!(error.may_have_run(), "{error}");
-            assert!(tokio::time::Instant::now() < deadline, "{error}");
+            assert!(Instant::now() < deadline, "{error}");
         }
         server.signal(Signal::SIGKILL);
     }

@@ -183,7 +183,7 @@ async fn a_goal_is_rejected_with_the_words_of_its_server_and_one_left_undecided_
     let rejected = Some(GoalEvent::Rejected("no way".to_owned()));
     assert_eq!(within("the answer", events).await.unwrap(), rejected);
 
-    let mut goal = sender.send_goal([1; 16], &1i32.to_le_bytes());
+    let mut goal = sender.send_goal([1; 16], &1i32.to_le_bytes(), later());
     let undecided = next_goal(&mut server).await;
     // The goal counts as accepted after a while, so its client does not wait any longer.
     is_accepted(&mut goal).await;

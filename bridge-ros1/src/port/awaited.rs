@@ -64,7 +64,7 @@ impl Missing<'_> {
         missing.add(format!("topic {topic}"), || {
             let typed = source.expected.as_ref().filter(|_| source.has_strangers());
             match typed {
-                Some(expected) => match self.graph.types.get(topic) {
+                Some(expected) => match self.side.graph.types.get(topic) {
                     Some(of) if *of != expected.to_string() => format!(
                         "{publisher} publishes it as {of}, but the mapping has the type {expected}"
                     ),

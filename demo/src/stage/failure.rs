@@ -78,7 +78,7 @@ impl Failure {
 }
 
 /// Returns the exit code of a scenario whose end was printed, or not.
-pub(crate) fn exit_code(outcome: &Result<(), Failure>, printed: &std::io::Result<()>) -> u8 {
+pub(crate) fn exit_code(outcome: &Result<(), Failure>, printed: &io::Result<()>) -> u8 {
     match (outcome, printed) {
         (Err(failure), _) => failure.exit_code(),
         // Standard output is closed, for example by `| head`.

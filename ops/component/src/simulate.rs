@@ -307,9 +307,8 @@ async fn simulated(device: Device) -> io::Result<()> {
             let simulator = ur::simulator::Simulator::new(settings);
             let serving = ur::simulator::Serving::start(&simulator, &rtde, &secondary).await?;
             let (rtde, secondary) = (serving.rtde(), serving.secondary());
-            told(&format!(
-                "universal-robot at rtde {rtde}, secondary {secondary}"
-            ))?;
+            let at = format!("universal-robot at rtde {rtde}, secondary {secondary}");
+            told(&at)?;
             Box::new(serving)
         }
         Device::Changer {

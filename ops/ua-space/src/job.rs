@@ -22,7 +22,7 @@ pub(crate) fn job(arguments: &JobArguments) -> Result<(), Failure> {
             let answer = change("POST", "/jobs", ("application/json", body.into_bytes()), at)?;
             let started: Started = read(&answer.body)?;
             say(&format!("job {}: started", started.job))?;
-            if wait {
+            if *wait {
                 follow(started.job, at)
             } else {
                 Ok(())

@@ -193,8 +193,13 @@ impl ComponentServer {
         }
         let skills: Vec<Skill> = served.iter().map(|(skill, _)| skill.clone()).collect();
         if let Some(power_off) = settings.power_off.clone() {
-            let by = (power_off, users);
-            power::serve(&server, &root.node_id, &mut ids, &skills, by)?;
+            power::serve(
+                &server,
+                &root.node_id,
+                &mut ids,
+                &skills,
+                (power_off, users),
+            )?;
         }
         let mut tasks = JoinSet::new();
         if let Some(device) = component.device.clone() {
@@ -211,12 +216,8 @@ impl ComponentServer {
         tasks.spawn(Lock::serve(&server, &authority, &root.node_id, &mut ids)?);
         if let Some(robot) = &component.robot {
             let of = (skills.as_slice(), values.live.as_slice());
-            tasks.spawn(robot::serve(
-                &server,
-                (&component.name, robot),
-                of,
-                &mut ids,
-            )?);
+            let named = (component.name.as_str(), robot);
+            tasks.spawn(robot::serve(&server, named, of, &mut ids)?);
         }
         tasks.spawn(shown);
         let values = (values, &configuration);

@@ -337,12 +337,8 @@ async fn prepare<P: Program>(
     } = changes.borrow().clone();
     log_start::<P>(arguments, own, about.hash());
     let hub = host.hub(several);
-    let (carrier, group) = carrier::open(
-        (P::NAME, own),
-        (arguments, &mapping),
-        changes,
-        (several, hub),
-    )?;
+    let name = (P::NAME, own);
+    let (carrier, group) = carrier::open(name, (arguments, &mapping), changes, (several, hub))?;
     let settings = Settings {
         own,
         local: P::LOCAL,

@@ -262,7 +262,7 @@ impl Step {
                 message,
                 results,
             } => {
-                let mut text = if succeeded {
+                let mut text = if *succeeded {
                     "succeeded".to_owned()
                 } else {
                     "failed".to_owned()
