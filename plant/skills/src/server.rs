@@ -155,8 +155,8 @@ impl ComponentServer {
         let server = server_of(component, settings, &users)?;
         let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
         let root = root(&server, component, &mut ids)?;
-        let configure_by = (settings.supervision.clone(), Arc::clone(&users));
-        place::configurable(&server, &root.node_id, &mut ids, configure_by)?;
+        let by = (settings.supervision.clone(), Arc::clone(&users));
+        place::configurable(&server, &root.node_id, &mut ids, by.clone())?;
         let folder = root
             .node("Skills")
             .cloned()
@@ -171,7 +171,6 @@ impl ComponentServer {
         };
         let store = settings.configuration.as_deref();
         let configuration = Configuration::new(component.configurable.clone(), store);
-        let by = (settings.supervision.clone(), Arc::clone(&users));
         let shown = configuration::serve(&server, &root.node_id, &mut ids, (&configuration, by))?;
         let authority = Authority::new();
         let mut served = Vec::new();
@@ -193,13 +192,8 @@ impl ComponentServer {
         }
         let skills: Vec<Skill> = served.iter().map(|(skill, _)| skill.clone()).collect();
         if let Some(power_off) = settings.power_off.clone() {
-            power::serve(
-                &server,
-                &root.node_id,
-                &mut ids,
-                &skills,
-                (power_off, users),
-            )?;
+            let by = (power_off, users);
+            power::serve(&server, &root.node_id, &mut ids, &skills, by)?;
         }
         let mut tasks = JoinSet::new();
         if let Some(device) = component.device.clone() {
