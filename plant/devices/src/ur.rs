@@ -30,7 +30,7 @@ pub use self::follower::Follower;
 use self::force::Guard;
 pub use self::pose::{of_robot, to_robot};
 use self::rtde::Rtde;
-use self::state::{INPUTS, OUTPUTS, STOPPED, State};
+use self::state::{INPUTS, OUTPUTS, PAUSED, STOPPED, State};
 use self::wire::Value;
 use crate::modbus::connected;
 use crate::sensors::value;
@@ -573,7 +573,8 @@ impl Session {
         self.stand(work).await
     }
 
-    /// Returns the state of the robot when it stands after the stop program.
+    /// Returns the state of the robot when it stands after the stop program. With a paused program,
+    /// it stands whether or not it has taken the stop program, and may go on.
     ///
     /// # Errors
     /// The robot may move: the outcome is unknown.
@@ -582,7 +583,11 @@ impl Session {
         loop {
             // The connection is not used after a dropped future.
             let why = match timeout_at(asked + BRAKED, self.state()).await {
-                Ok(Ok(at)) if asked.elapsed() > SETTLED && at.speed < STILL => return Ok(at),
+                Ok(Ok(at))
+                    if asked.elapsed() > SETTLED && at.speed < STILL && at.runtime != PAUSED =>
+                {
+                    return Ok(at);
+                }
                 Ok(Ok(_)) => continue,
                 Ok(Err(why)) => why,
                 Err(_) => format!("the robot is not seen to stop within {BRAKED:?}"),

@@ -90,5 +90,7 @@ impl State {
 
 /// `runtime_state` without a program. A paused program is another state.
 pub(super) const STOPPED: u32 = 1;
+/// `runtime_state` with a paused program.
+pub(super) const PAUSED: u32 = 4;
 /// Distance from the tool at which its rotation counts as speed, m.
 const LEVER: f64 = 0.1;
