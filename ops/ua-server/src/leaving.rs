@@ -84,6 +84,9 @@ impl Departing {
 #[derive(Debug)]
 pub(crate) struct Leaving {
     values: Vec<(TopicId, Departure)>,
+    /// The reported value that the run loop has not handled. The run loop may send the values
+    /// before it first, and their results are not those of this value.
+    reported: Vec<(TopicId, Departure)>,
     /// Polls for the next write of a client that waits for each result.
     next: BusyPoll,
 }
@@ -96,6 +99,7 @@ impl Default for Leaving {
         };
         Self {
             values: Vec::new(),
+            reported: Vec::new(),
             next: BusyPoll::new(window),
         }
     }
@@ -105,7 +109,12 @@ impl Leaving {
     /// Adds a value that is passed on to the run loop.
     pub(crate) fn add(&mut self, topic: TopicId, departure: Departure) {
         self.next.arrived(bridge_node::now().monotonic);
-        self.values.push((topic, departure));
+        self.reported.push((topic, departure));
+    }
+
+    /// Records that the run loop has handled the reported value.
+    pub(crate) fn handled(&mut self) {
+        self.values.append(&mut self.reported);
     }
 
     /// Answers the writes of a topic.
@@ -121,7 +130,7 @@ impl Leaving {
         }
     }
 
-    /// Answers all writes: their values equal the previous ones, wait for their turn, or are not
+    /// Answers all handled writes: their values equal the previous ones, wait for their turn, or are not
     /// sent because another server is active.
     pub(crate) fn drained(&mut self, is_muted: bool) {
         let status = match is_muted {
@@ -163,6 +172,10 @@ mod tests {
         let mut leaving = Leaving::default();
         let (departure, departing) = departure();
         leaving.add(topic(30), departure);
+        // The values before it were sent.
+        leaving.left(topic(30), Ok(()));
+        leaving.drained(false);
+        leaving.handled();
         steps(&mut leaving);
         drop(leaving);
         departing.left().await

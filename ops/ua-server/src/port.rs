@@ -316,6 +316,10 @@ impl Port for ServerPort {
         // Values of every type have a node.
     }
 
+    fn handled(&mut self, _topic: TopicId) {
+        self.writes.handled();
+    }
+
     fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
         self.writes.left(topic, sent);
     }

@@ -46,12 +46,18 @@ pub trait Port: Send + 'static {
         Handover::Done
     }
 
+    /// Notes that a reported sample was handled. Its result follows by [`left`](Self::left) or
+    /// [`drained`](Self::drained); earlier calls of these are about earlier samples.
+    fn handled(&mut self, topic: TopicId) {
+        let _nobody_waits = topic;
+    }
+
     /// Notes that a sample of this side was sent to the group, or the reason why it is not sent.
     fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
         let _nobody_waits = (topic, sent);
     }
 
-    /// Notes that the outputs of all reported events were carried out. A reported sample that has
+    /// Notes that the outputs of all handled events were carried out. A handled sample that has
     /// not [`left`](Self::left) equals the previous sample or waits for its turn; if this program
     /// is muted because another program is active, it is not sent.
     fn drained(&mut self, is_muted: bool) {

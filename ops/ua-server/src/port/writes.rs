@@ -49,6 +49,11 @@ impl ClientWrites {
         self.leaving.polls()
     }
 
+    /// Records that the run loop has handled the reported value.
+    pub(super) fn handled(&mut self) {
+        self.leaving.handled();
+    }
+
     /// Records the result of sending a value.
     pub(super) fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
         self.leaving.left(topic, sent);

@@ -81,9 +81,10 @@ impl<P: Port> Shell<P> {
         redundancy.is_some_and(Redundancy::mutes_group)
     }
 
-    /// Reports the verdict on a sample of the port that is dropped. The Router has counted it. An
-    /// unchanged sample was sent before.
+    /// Reports that a sample of the port was handled, and the verdict if it is dropped. The Router
+    /// has counted it. An unchanged sample was sent before.
     pub(super) fn judged(&mut self, topic: TopicId, verdict: Verdict) {
+        self.port.handled(topic);
         if let Verdict::Drop(reason) = verdict
             && reason != Reason::Unchanged
         {
