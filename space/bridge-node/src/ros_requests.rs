@@ -59,12 +59,13 @@ impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
     ) -> Poll<()> {
         if let Poll::Ready(outcome) = self.services.poll_recv(cx) {
             events.extend(self.services.ended(outcome, now().utc));
-        } else if let Poll::Ready(event) = self.calls.poll_recv::<G>(cx) {
-            events.push_back(event);
         } else if let Poll::Ready(executed) = self.executing.poll_recv(cx) {
             events.extend(executed);
         } else if let Poll::Ready(reports) = self.actions.poll_recv(cx) {
             events.extend(reports);
+        } else if let Poll::Ready(event) = self.calls.poll_recv::<G>(cx) {
+            // After the others, so that a flood of requests does not delay outcomes.
+            events.push_back(event);
         } else {
             return Poll::Pending;
         }
