@@ -71,6 +71,8 @@ async fn follow(
     })?;
     let mut watch = skill.watch();
     let mut is_interrupted = false;
+    // An output that is closed does not end the command before the procedure.
+    let mut printed = Ok(());
     let outcome = loop {
         let is_over = |shown: &Arc<Shown>| {
             let outcome = shown.outcome.as_ref();
@@ -78,23 +80,27 @@ async fn follow(
         };
         tokio::select! {
             biased;
-            Some(step) = told.steps.recv() => print(arguments.json, &step)?,
+            Some(step) = told.steps.recv() => {
+                printed = printed.and_then(|()| print(arguments.json, &step));
+            }
             ended = watch.wait_for(is_over) => {
                 let shown = ended.map_err(|_| Failure::Failed("the skill ended".to_owned()))?;
                 break shown.outcome.clone();
             }
             () = interrupt.received() => {
                 is_interrupted = true;
-                say("stopping; the command ends when the end of the procedure is known")?;
                 let skill = skill.clone();
                 // A refused Halt finds the run at its end.
                 drop(tokio::spawn(async move { skill.call(BY, Method::Halt).await }));
+                let text = "stopping; the command ends when the end of the procedure is known";
+                printed = printed.and_then(|()| say(text));
             }
         }
     };
     while let Ok(step) = told.steps.try_recv() {
-        print(arguments.json, &step)?;
+        printed = printed.and_then(|()| print(arguments.json, &step));
     }
+    printed?;
     let lost = told.lost.load(Ordering::Relaxed);
     if lost > 0 {
         say(&format!("{lost} steps are not shown"))?;
