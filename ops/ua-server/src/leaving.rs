@@ -112,21 +112,23 @@ impl Leaving {
         self.reported.push((topic, departure));
     }
 
-    /// Records that the run loop has handled the reported value.
-    pub(crate) fn handled(&mut self) {
-        self.values.append(&mut self.reported);
+    /// Records that the run loop has handled the reported value, or answers its write if the value
+    /// is dropped.
+    pub(crate) fn handled(&mut self, taken: Result<(), Reason>) {
+        if taken.is_ok() {
+            self.values.append(&mut self.reported);
+            return;
+        }
+        for (_, departure) in self.reported.drain(..) {
+            departure.answer(status(taken));
+        }
     }
 
     /// Answers the writes of a topic.
     pub(crate) fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
-        let status = match sent {
-            Ok(()) => StatusCode::Good,
-            Err(Reason::Takeover) => NOT_ACTIVE,
-            Err(_) => StatusCode::BadCommunicationError,
-        };
         let left = self.values.extract_if(.., |(of, _)| *of == topic);
         for (_, departure) in left {
-            departure.answer(status);
+            departure.answer(status(sent));
         }
     }
 
@@ -145,6 +147,15 @@ impl Leaving {
     /// Returns whether the run loop polls for the next write instead of sleeping.
     pub(crate) fn polls(&mut self) -> bool {
         self.next.looks(|| bridge_node::now().monotonic)
+    }
+}
+
+/// Returns the answer to a write by the result of sending its value.
+const fn status(sent: Result<(), Reason>) -> StatusCode {
+    match sent {
+        Ok(()) => StatusCode::Good,
+        Err(Reason::Takeover) => NOT_ACTIVE,
+        Err(_) => StatusCode::BadCommunicationError,
     }
 }
 
@@ -175,7 +186,7 @@ mod tests {
         // The values before it were sent.
         leaving.left(topic(30), Ok(()));
         leaving.drained(false);
-        leaving.handled();
+        leaving.handled(Ok(()));
         steps(&mut leaving);
         drop(leaving);
         departing.left().await
@@ -213,6 +224,20 @@ mod tests {
         let (departure, departing) = departure();
         departure.refuse();
         assert_eq!(departing.left().await, Err(StatusCode::BadInvalidState));
+    }
+
+    #[tokio::test]
+    async fn a_write_that_is_dropped_does_not_answer_the_write_before_it() {
+        let mut leaving = Leaving::default();
+        let (first, queued) = departure();
+        let (second, dropped) = departure();
+        leaving.add(topic(30), first);
+        leaving.handled(Ok(()));
+        leaving.add(topic(30), second);
+        leaving.handled(Err(Reason::TooBig));
+        leaving.left(topic(30), Ok(()));
+        assert_eq!(queued.left().await, Ok(()));
+        assert_eq!(dropped.left().await, Err(StatusCode::BadCommunicationError));
     }
 
     #[tokio::test]

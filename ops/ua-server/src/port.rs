@@ -316,8 +316,8 @@ impl Port for ServerPort {
         // Values of every type have a node.
     }
 
-    fn handled(&mut self, _topic: TopicId) {
-        self.writes.handled();
+    fn handled(&mut self, _topic: TopicId, taken: Result<(), Reason>) {
+        self.writes.handled(taken);
     }
 
     fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {

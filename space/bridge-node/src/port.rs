@@ -46,10 +46,11 @@ pub trait Port: Send + 'static {
         Handover::Done
     }
 
-    /// Notes that a reported sample was handled. Its result follows by [`left`](Self::left) or
-    /// [`drained`](Self::drained); earlier calls of these are about earlier samples.
-    fn handled(&mut self, topic: TopicId) {
-        let _nobody_waits = topic;
+    /// Notes that a reported sample was handled, or the reason why it was dropped. Otherwise its
+    /// result follows by [`left`](Self::left) or [`drained`](Self::drained); earlier calls of these
+    /// are about earlier samples.
+    fn handled(&mut self, topic: TopicId, taken: Result<(), Reason>) {
+        let _nobody_waits = (topic, taken);
     }
 
     /// Notes that a sample of this side was sent to the group, or the reason why it is not sent.

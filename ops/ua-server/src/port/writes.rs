@@ -49,9 +49,9 @@ impl ClientWrites {
         self.leaving.polls()
     }
 
-    /// Records that the run loop has handled the reported value.
-    pub(super) fn handled(&mut self) {
-        self.leaving.handled();
+    /// Records that the run loop has handled the reported value, or why it dropped the value.
+    pub(super) fn handled(&mut self, taken: Result<(), Reason>) {
+        self.leaving.handled(taken);
     }
 
     /// Records the result of sending a value.

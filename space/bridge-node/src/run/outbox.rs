@@ -84,12 +84,11 @@ impl<P: Port> Shell<P> {
     /// Reports that a sample of the port was handled, and the verdict if it is dropped. The Router
     /// has counted it. An unchanged sample was sent before.
     pub(super) fn judged(&mut self, topic: TopicId, verdict: Verdict) {
-        self.port.handled(topic);
-        if let Verdict::Drop(reason) = verdict
-            && reason != Reason::Unchanged
-        {
-            self.port.left(topic, Err(reason));
-        }
+        let taken = match verdict {
+            Verdict::Drop(reason) if reason != Reason::Unchanged => Err(reason),
+            Verdict::Drop(_) | Verdict::Forward | Verdict::ForwardAfterDroppingOldest => Ok(()),
+        };
+        self.port.handled(topic, taken);
     }
 
     fn parcel_left(&mut self, parcel: Parcel, sent: Result<(), (Reason, &str)>) {
