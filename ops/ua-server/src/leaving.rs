@@ -132,8 +132,8 @@ impl Leaving {
         }
     }
 
-    /// Answers all handled writes: their values equal the previous ones, wait for their turn, or are not
-    /// sent because another server is active.
+    /// Answers all handled writes: their values equal the previous ones, wait for their turn, or
+    /// are not sent because another server is active.
     pub(crate) fn drained(&mut self, is_muted: bool) {
         let status = match is_muted {
             true => NOT_ACTIVE,
