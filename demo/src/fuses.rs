@@ -1,6 +1,6 @@
 //! Fuses: an arm inserts a fuse into a fuse box, with a limited force. The first try hits the box
-//! beside the slot; the process of the MES backs off and tries again. Then the arm is replaced by an
-//! arm of another make, and the same process runs on it.
+//! beside the slot; the process of the MES backs off and tries again. Then the arm is replaced by
+//! an arm of another make, and the same process runs on it.
 
 mod report;
 

@@ -92,7 +92,8 @@ enum Scenario {
     ToolChange,
     /// Three simulated process modules that a recipe of BatchML runs: dose, stir and react
     Batch,
-    /// An arm that inserts a fuse with a limited force and tries again; then an arm of another make does the same
+    /// An arm that inserts a fuse with a limited force and tries again; then an arm of another make
+    /// does the same
     Fuses,
     /// A robot, a tool changer and a gripper that place terminal blocks onto a rail
     Terminals,

@@ -1,7 +1,7 @@
 //! Fuzzes recipes of BatchML and BPMN with arbitrary bytes.
 
-/// Reads the contents of a source, which are no recipe, have a process, or have findings with lines of
-/// the file.
+/// Reads the contents of a source, which are no recipe, have a process, or have findings with lines
+/// of the file.
 pub fn recipe(input: &[u8]) {
     match ua_mes::read_recipe(input) {
         Ok(processes) => assert_ne!(processes, Some(0)),

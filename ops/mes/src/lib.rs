@@ -146,8 +146,8 @@ pub fn run(arguments: Vec<OsString>) -> ExitCode {
     bridge_node::run::<UaMes>(arguments)
 }
 
-/// Reads a recipe of BatchML or BPMN, as `ua-space process import` sends it. Returns the number of its
-/// processes; `None` if the contents are no recipe. For tests with changed files.
+/// Reads a recipe of BatchML or BPMN, as `ua-space process import` sends it. Returns the number of
+/// its processes; `None` if the contents are no recipe. For tests with changed files.
 ///
 /// # Errors
 /// The lines of the elements that no process can have, from 1; no line if the contents cannot be

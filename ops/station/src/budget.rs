@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
-/// The nodes that a face shows of all servers together. A server keeps its nodes until it leaves, so
-/// that a server with many nodes does not displace others.
+/// The nodes that a face shows of all servers together. A server keeps its nodes until it leaves,
+/// so that a server with many nodes does not displace others.
 #[derive(Debug)]
 pub(crate) struct NodeBudget {
     most: usize,

@@ -67,8 +67,8 @@ impl Callers {
     }
 
     /// Returns the client of a caller, connected to the same run of the server as the station
-    /// itself. The server of the station drops this future at the timeout of the caller, and nothing
-    /// is forwarded then.
+    /// itself. The server of the station drops this future at the timeout of the caller, and
+    /// nothing is forwarded then.
     ///
     /// # Errors
     /// There is no such connection.

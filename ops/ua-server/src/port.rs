@@ -2,8 +2,8 @@
 //!
 //! The port wires types that own their state: the running server with its users and certificates
 //! ([`RunningServer`]), the values that clients write ([`ClientWrites`]), the values that the
-//! address space shows ([`ShownValues`]), the Methods for calls of other spaces, and the connections
-//! to other servers.
+//! address space shows ([`ShownValues`]), the Methods for calls of other spaces, and the
+//! connections to other servers.
 
 mod running;
 mod shown;

@@ -1,5 +1,5 @@
-//! `ua-space aas`: the asset administration shell (AAS V3) of a process module, from its manifest, as
-//! JSON or as a package (AASX).
+//! `ua-space aas`: the asset administration shell (AAS V3) of a process module, from its manifest,
+//! as JSON or as a package (AASX).
 
 mod elements;
 mod package;

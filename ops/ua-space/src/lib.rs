@@ -62,8 +62,8 @@ use clap::error::ErrorKind;
 use arguments::{Arguments, Verb};
 use exit::Failure;
 
-/// Reads a SysML model: XMI, or the textual notation of SysML v2. Returns the number of its values and
-/// calls. For tests with changed files.
+/// Reads a SysML model: XMI, or the textual notation of SysML v2. Returns the number of its values
+/// and calls. For tests with changed files.
 ///
 /// # Errors
 /// The lines of the findings, from 1.

@@ -1,5 +1,5 @@
-//! HTTP/1.1 client of devices, with or without TLS: one connection per request, responses bounded in
-//! time and size.
+//! HTTP/1.1 client of devices, with or without TLS: one connection per request, responses bounded
+//! in time and size.
 
 use std::fmt;
 use std::time::Duration;

@@ -470,9 +470,9 @@ impl Session {
         }
     }
 
-    /// Ends the run of a robot that stands by itself, as in a protective stop. Such a stop pauses the
-    /// program, which goes on when the robot is released: then the outcome is unknown. Returns the
-    /// reason.
+    /// Ends the run of a robot that stands by itself, as in a protective stop. Such a stop pauses
+    /// the program, which goes on when the robot is released: then the outcome is unknown. Returns
+    /// the reason.
     ///
     /// # Errors
     /// The robot may go on, or start later: the outcome is unknown.

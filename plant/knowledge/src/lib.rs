@@ -13,10 +13,10 @@
 //! source.
 //!
 //! Reading order: `source` (the named graphs), `store`, `writing` (replacement), `rules` (derived
-//! statements), `journal` (lasting sources), `component` and `nodeset` (facts to statements), `question` (named
-//! queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the queries that run at a
-//! time), `http`, `update` and `writes` (changes by users), `shapes` and `checking` (the SHACL
-//! report), `units` (conversion of numbers).
+//! statements), `journal` (lasting sources), `component` and `nodeset` (facts to statements),
+//! `question` (named queries), `query` and `bounds` (any SPARQL, within limits), `lanes` (the
+//! queries that run at a time), `http`, `update` and `writes` (changes by users), `shapes` and
+//! `checking` (the SHACL report), `units` (conversion of numbers).
 
 mod bounds;
 mod checking;

@@ -1,5 +1,5 @@
-//! Relays one topic of a DDS domain to another. The benchmarks compare it with relays of Cyclone DDS
-//! and Fast DDS.
+//! Relays one topic of a DDS domain to another. The benchmarks compare it with relays of Cyclone
+//! DDS and Fast DDS.
 //!
 //! `ros2_relay FROM TO [DOMAIN]`: topics of `std_msgs/msg/String`, on loopback, until SIGTERM.
 

@@ -123,8 +123,8 @@ impl Direction {
     }
 }
 
-/// Completes the checksum of a UDP datagram or TCP segment over IPv4. The sender's kernel leaves it to
-/// the network card, which a pair of veth does not have. For UDP it is optional, and cleared.
+/// Completes the checksum of a UDP datagram or TCP segment over IPv4. The sender's kernel leaves it
+/// to the network card, which a pair of veth does not have. For UDP it is optional, and cleared.
 fn finish_checksum(frame: &mut [u8]) {
     let is_ipv4 = frame.len() > ETHERNET + 20
         && frame[12..14] == [0x08, 0x00]

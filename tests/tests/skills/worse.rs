@@ -1,5 +1,5 @@
-//! Skills over worse networks: a link that is interrupted during a run, and one that loses and delays
-//! frames.
+//! Skills over worse networks: a link that is interrupted during a run, and one that loses and
+//! delays frames.
 
 use std::time::Duration;
 

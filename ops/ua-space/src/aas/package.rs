@@ -1,4 +1,5 @@
-//! AASX (IDTA-01005): a package of OPC (ECMA-376) with a shell as JSON and the manifest of the module.
+//! AASX (IDTA-01005): a package of OPC (ECMA-376) with a shell as JSON and the manifest of the
+//! module.
 
 use std::io::{self, Write as _};
 

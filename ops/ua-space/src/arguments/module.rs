@@ -27,8 +27,9 @@ pub(crate) enum MtpVerb {
     /// Follows the handshake of VDI/VDE/NAMUR 2658-4. Ctrl-C withdraws a Start without effect, or
     /// stops the service; the command ends when the end of the procedure is known.
     ///
-    /// Exit codes: 0 Completed, 1 not Completed, 64 usage, 65 the file is no manifest, 69 the end is
-    /// unknown, 74 the file cannot be read or the output cannot be written, 130 stopped by Ctrl-C.
+    /// Exit codes: 0 Completed, 1 not Completed, 64 usage, 65 the file is no manifest, 69 the end
+    /// is unknown, 74 the file cannot be read or the output cannot be written, 130 stopped by
+    /// Ctrl-C.
     Run(MtpRun),
 }
 

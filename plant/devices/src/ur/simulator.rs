@@ -126,8 +126,8 @@ impl Simulator {
         self.lock().silent = silent;
     }
 
-    /// Sets or clears a protective stop, as after a contact. The running program is paused, and goes
-    /// on after [`play`](Self::play).
+    /// Sets or clears a protective stop, as after a contact. The running program is paused, and
+    /// goes on after [`play`](Self::play).
     pub fn set_protective_stop(&self, stopped: bool) {
         let mut robot = self.lock();
         robot.safety = if stopped { PROTECTIVE_STOP } else { NORMAL };

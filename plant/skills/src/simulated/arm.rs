@@ -28,8 +28,8 @@ pub struct ArmSettings {
     pub hole: Option<Hole>,
 }
 
-/// A round hole in the surface below a tool, as that of a slot for a part. In m, in the frame of the
-/// base of the robot.
+/// A round hole in the surface below a tool, as that of a slot for a part. In m, in the frame of
+/// the base of the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hole {
     /// x of the centre.

@@ -253,8 +253,8 @@ fn journal(cell: &Cell, statements: usize) {
     row(&what, &format!("{:.1} s", time.as_secs_f64()), "< 10 s");
 }
 
-/// Searches the plan of a counter of four bits, which has 15 steps, beside four switches that it does
-/// not need.
+/// Searches the plan of a counter of four bits, which has 15 steps, beside four switches that it
+/// does not need.
 fn plan(cell: &Cell) {
     let mut text =
         "@prefix ua: <urn:ua-bridge:plant#> . @prefix f: <urn:example:fact:> .\n".to_owned();

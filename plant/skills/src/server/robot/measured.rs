@@ -1,4 +1,5 @@
-//! The axes, the speed and the safety state of a robot of OPC 40010-1, from values of its component.
+//! The axes, the speed and the safety state of a robot of OPC 40010-1, from values of its
+//! component.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -57,7 +58,8 @@ pub(super) fn speed(server: &Server, arm: &Instance, values: &[LiveValue]) -> Op
     Some(keep(server, vec![node], value, percent))
 }
 
-/// Creates the safety state of the value `SafetyMode`. Returns its update, if there is such a value.
+/// Creates the safety state of the value `SafetyMode`. Returns its update, if there is such a
+/// value.
 pub(super) fn safety(
     maker: &mut Maker<'_>,
     system: &Instance,
