@@ -2,8 +2,8 @@
 //!
 //! A single task owns all state; [`Ros1Port::recv`](Port::recv) is its only wait. The port wires
 //! types that own their state: the subscribed topics ([`Sources`]), the published topics
-//! ([`Sinks`]), and services and actions ([`Ros1Requests`]). They share the node and what it knows
-//! of the graph ([`Ros1Side`]).
+//! ([`Sinks`]), and services and actions ([`Ros1Requests`]). They share the node and its view of
+//! the graph ([`Ros1Side`]).
 
 mod action_servers;
 mod awaited;

@@ -6,7 +6,7 @@
 //!
 //! The port wires types that own their state: the topics that the bridge reads ([`Sources`]), the
 //! topics that it writes ([`Sinks`]), and services and actions ([`Ros2Requests`]). They share the
-//! node and what it knows of the domain ([`Ros2Side`]).
+//! node and its view of the domain ([`Ros2Side`]).
 
 mod action_graph;
 mod awaited;

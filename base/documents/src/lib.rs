@@ -1,4 +1,4 @@
-//! What the front ends of YAML documents share: positions in a text, findings rendered with their
+//! Shared parts of the readers of YAML documents: positions in a text, findings rendered with their
 //! source line, texts that cannot control a terminal, and the search for misspelt names.
 
 mod excerpt;

@@ -2,7 +2,7 @@
 
 use granit_parser::Span;
 
-/// A part of one line of a text.
+/// A range of columns in a line of a text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct SourceSpan {
     /// The line, from 1.

@@ -12,7 +12,7 @@ use tokio::task::JoinSet;
 
 pub use hyper::{Method, Request, Response, StatusCode, header};
 
-/// A connection for one request.
+/// A connection for a single request.
 #[derive(Debug)]
 pub struct Connection {
     sender: SendRequest<Full<Bytes>>,

@@ -39,7 +39,7 @@ pub fn next(now: Instant, pause: Duration) -> Instant {
 /// Rounds a time up to a multiple of [`TICK`].
 fn round_up(time: Duration) -> Duration {
     let tick = TICK.as_millis();
-    // The remainder of a millisecond belongs to the next one.
+    // A fraction of a millisecond is rounded up.
     let ticks = time.saturating_sub(Duration::from_nanos(1)).as_millis() / tick + 1;
     let ticks = if time.is_zero() { 0 } else { ticks };
     TICK * u32::try_from(ticks).unwrap_or(u32::MAX)

@@ -291,7 +291,7 @@ impl Sinks {
         }
     }
 
-    /// Drops former writers whose readers have all samples.
+    /// Drops replaced writers after their readers have received all samples.
     pub(super) fn drop_former(&mut self, now: Instant) {
         self.former.retain(|former| !former.is_done(now));
     }

@@ -55,8 +55,8 @@ impl Mes {
         Self { tool, port }
     }
 
-    /// Waits until each step of a process has a skill, or until one has none. Returns the time that
-    /// this took, in ms.
+    /// Waits until the plan of a process has a skill for each step or, without `complete`, until a
+    /// step has no skill. Returns the waiting time in ms.
     pub(crate) async fn planned(&self, process: &str, complete: bool) -> Result<f64, Stop> {
         let began = Instant::now();
         loop {

@@ -1,4 +1,4 @@
-//! The file of the job orders: written anew before each change is acknowledged.
+//! The file of the job orders. The whole file is rewritten before a change is acknowledged.
 
 use std::fs::{self, File};
 use std::io::{self, Write as _};

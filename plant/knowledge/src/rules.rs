@@ -2,8 +2,8 @@
 //!
 //! Covered are `scm-sco`, `scm-spo`, `scm-eqc1`, `scm-eqp1`, `cax-sco`, `cax-eqc`, `prp-dom`,
 //! `prp-rng`, `prp-spo1`, `prp-eqp`, `prp-inv`, `prp-symp` and `prp-trp`, for named classes and
-//! properties outside RDF, RDFS and OWL. The schema is what the sources state: a statement of the
-//! schema that would itself follow from other rules than these is not used.
+//! properties outside RDF, RDFS and OWL. The schema has only statements of the sources: a schema
+//! statement that would follow by other rules of OWL 2 RL is not used.
 //!
 //! All rules except transitivity have a single statement of the plant as their premise. So the
 //! support of a derived statement is found among the statements of its two nodes, and a change is

@@ -246,8 +246,8 @@ impl Alarm {
     }
 }
 
-/// Deadlines that are further away are met up to a tick late. They are those of heartbeats, leases
-/// and clean-ups, which last for seconds.
+/// Deadlines that are further away are met up to a tick late. They belong to heartbeats, leases and
+/// clean-ups, which last for seconds.
 const COARSE: Duration = Duration::from_millis(500);
 /// Deadlines that are nearer are set by the alarm.
 const SHORT: Duration = Duration::from_millis(2);

@@ -19,9 +19,9 @@ use crate::policy::{Policy, is_bad};
 use crate::port::{Delivery, Execution, PortEvent};
 use crate::services::{ServiceCall, ServiceGraph, Services};
 
-/// The services and actions of a ROS port: those of other spaces for the local side, and those of
-/// the local side for other spaces. `S` is the server of an offered service, and `E` the client of
-/// an executed service.
+/// The services and actions of a ROS port in both directions: calls of other spaces that are offered
+/// to the local side, and calls of the local side that are executed for other spaces. `S` is the
+/// server of an offered service, and `E` the client of an executed service.
 #[derive(Debug)]
 pub struct RosRequests<S, E> {
     /// Services that are called for values.
@@ -135,7 +135,7 @@ impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
         self.actions.known(topic, description);
     }
 
-    /// Records that a call of another space has no executor any more.
+    /// Records that the executor of a call of another space was lost.
     pub fn gone(&mut self, topic: TopicId, now: Instant) {
         self.calls.gone(topic, now);
         self.actions.gone(topic, now);

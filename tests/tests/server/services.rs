@@ -51,7 +51,7 @@ fn a_durable_subscription_outlives_its_client_and_their_number_is_bounded() {
     let lines = cell.asyncua_once("opcua_durable.py", &[SERVER_ENDPOINT]);
     // Anonymous users without security continue no subscription of another session (5.14.7.2).
     let statuses = json!({"plain": "BadSubscriptionIdInvalid", "durable": "BadUserAccessDenied"});
-    // The server has 100 durable subscriptions, with the one that was left.
+    // The server has 100 durable subscriptions, including the subscription that was left behind.
     let bound = json!({"made": 99, "refused": "BadTooManySubscriptions", "rejected": 1});
     assert_eq!(lines, [statuses, bound]);
 }

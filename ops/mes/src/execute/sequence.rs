@@ -181,7 +181,7 @@ impl Execution<'_> {
     async fn resumed(&self) {
         let mut paused = self.paused.clone();
         if paused.wait_for(|is_paused| !is_paused).await.is_err() {
-            // Nobody can resume the run any more; it can be stopped.
+            // The sender of Resume was dropped: the run can only be stopped.
             std::future::pending::<()>().await;
         }
     }

@@ -110,7 +110,8 @@ impl ShownValues {
         self.space.grow_old();
     }
 
-    /// Applies changes of readers that clients enabled or disabled, and returns those of writers.
+    /// Enables and disables readers as clients requested, and returns the writers that clients
+    /// enabled or disabled.
     pub(super) fn switched(&mut self) -> Vec<(TopicId, bool)> {
         let mut writers = Vec::new();
         for (topic, on) in self.pubsub.switched() {

@@ -1,5 +1,5 @@
-//! The graph of derived statements: made anew after a change of the schema, and changed in place
-//! after every other change.
+//! The graph of derived statements: computed again after a change of the schema, and updated in
+//! place after every other change.
 //!
 //! Except for the hierarchies of classes and properties, the graph has no statement that a source
 //! states.
@@ -437,7 +437,7 @@ impl<'a> Changing<'a> {
         Ok(derived)
     }
 
-    /// Returns whether a statement follows from stated ones.
+    /// Returns whether a statement follows from statements of sources.
     fn is_supported(&mut self, triple: &Triple) -> Result<bool, Stop> {
         let schema = self.schema;
         if triple.predicate.as_ref() == rdf::TYPE {

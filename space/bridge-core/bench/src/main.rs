@@ -16,8 +16,8 @@ use uadp::Timestamp;
 const ROUNDS: u32 = 15;
 const MESSAGES: u32 = 20_000;
 const MANY: u16 = 10_000;
-/// The time between two messages of a topic, for any number of topics. No value is old enough to be
-/// repeated.
+/// The time between two messages of a topic, for any number of topics. It is too short for a value
+/// to be repeated.
 const ROUND: Duration = Duration::from_millis(1);
 
 /// A measured case, with a name for tables and the command line.

@@ -274,7 +274,7 @@ fn a_fast_topic_beside_a_latched_value_does_not_push_that_out() {
             assert!(hear(&mut reader, sequence, stamp, now).is_ok());
         }
     }
-    // Delivered first, and again when it turns out to be one of several values.
+    // Delivered at first, and again when the topic turns out to have several values.
     assert!(heard_anew <= 2, "{heard_anew}");
 }
 

@@ -65,7 +65,7 @@ impl Values {
         }
         match output {
             Output::Action { .. } => true,
-            // Probes are sent, so that a standby learns what the active bridge knows.
+            // Probes are sent: a standby needs the announcements that the active bridge has received.
             Output::Discovery { bytes } => !NetworkMessage::decode(bytes)
                 .is_ok_and(|message| message.message_type() == NetworkMessageType::Probe),
             // Datagrams are muted where they are polled. All other outputs are for this program.
@@ -220,7 +220,7 @@ impl Values {
         is_muted
     }
 
-    /// Empties the queue of a topic: another bridge sends or delivers what waits in it.
+    /// Empties the queue of a topic, because another bridge sends or delivers its samples.
     pub(super) fn empty_topic(&mut self, topic: TopicId, now: Now) {
         if self.is_home(topic) {
             return self.mute_own(topic);

@@ -151,8 +151,8 @@ impl Redundant {
         change
     }
 
-    /// Begins the time as the active bridge, and returns what the former active bridge left. `gap`
-    /// is the time since its last heartbeat.
+    /// Makes this bridge the active bridge, and returns the values that the former active bridge
+    /// left. `gap` is the time since its last heartbeat.
     pub(super) fn take_over(
         &mut self,
         (gap, cause): (Option<Duration>, TakeoverCause),
@@ -240,8 +240,8 @@ impl Redundant {
         self.losses.insert(topic, (now.monotonic, delivery));
     }
 
-    /// Drops the held states of a topic that are no current values any more: those of an instance,
-    /// or all of them.
+    /// Drops the held states of a topic that are outdated: the states of an instance, or all states
+    /// of the topic.
     pub(super) fn drop_held(&mut self, topic: TopicId, instance: Option<Timestamp>) {
         match (instance, self.held.get_mut(&topic)) {
             (Some(_), Some(held)) => held.retain(|one| one.delivery.instance != instance),

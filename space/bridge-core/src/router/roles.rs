@@ -187,7 +187,7 @@ impl Roles<'_> {
 
     /// Continues where the former active bridge ended. `gap` is the time since its last heartbeat.
     fn take_over(&mut self, of: (Option<Duration>, TakeoverCause), now: Now) {
-        // The former active bridge may have sent or published what waits since the last output.
+        // The former active bridge may have sent or published the samples that wait here.
         let topics = self.values.topics.handles();
         for at in &topics {
             self.values.empty_topic(at.topic(), now);

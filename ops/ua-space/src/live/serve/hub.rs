@@ -165,9 +165,9 @@ impl Hub {
         self.offer(None, channel);
     }
 
-    /// Offers a channel of a topic, or of none. Its other channels stay, because writers with
-    /// different descriptions may alternate. [`Channels`](crate::live::channels::Channels) limits
-    /// their number.
+    /// Offers a channel of a topic, or a channel without a topic. The other channels of the topic
+    /// stay, because writers with different descriptions may alternate.
+    /// [`Channels`](crate::live::channels::Channels) limits their number.
     pub(super) fn offer(&self, topic: Option<TopicId>, channel: &Channel) {
         let mut state = self.state();
         let others = state.offered.entry(topic).or_default();

@@ -86,7 +86,7 @@ impl Robot {
             return Value::I32(*register);
         }
         let runs = self.program.is_some() && !self.paused;
-        // 2: a program runs; 4: it is paused; 1: there is none.
+        // 1: no program; 2: the program runs; 4: the program is paused.
         let runtime = match (&self.program, self.paused) {
             (None, _) => 1,
             (Some(_), false) => 2,
