@@ -19,9 +19,9 @@ use crate::policy::{Policy, is_bad};
 use crate::port::{Delivery, Execution, PortEvent};
 use crate::services::{ServiceCall, ServiceGraph, Services};
 
-/// The services and actions of a ROS port in both directions: calls of other spaces that are offered
-/// to the local side, and calls of the local side that are executed for other spaces. `S` is the
-/// server of an offered service, and `E` the client of an executed service.
+/// The services and actions of a ROS port in both directions: calls of other spaces that are
+/// offered to the local side, and calls of the local side that are executed for other spaces. `S`
+/// is the server of an offered service, and `E` the client of an executed service.
 #[derive(Debug)]
 pub struct RosRequests<S, E> {
     /// Services that are called for values.

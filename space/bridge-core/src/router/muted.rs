@@ -65,7 +65,7 @@ impl Values {
         }
         match output {
             Output::Action { .. } => true,
-            // Probes are sent: a standby needs the announcements that the active bridge has received.
+            // Probes are sent: a standby needs the announcements that the active bridge has.
             Output::Discovery { bytes } => !NetworkMessage::decode(bytes)
                 .is_ok_and(|message| message.message_type() == NetworkMessageType::Probe),
             // Datagrams are muted where they are polled. All other outputs are for this program.
