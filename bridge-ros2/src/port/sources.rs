@@ -136,7 +136,7 @@ impl Sources {
         }
     }
 
-    /// Drops replaced readers at the end of the time for their successors to be matched.
+    /// Drops replaced readers after the time in which publishers match the new readers.
     pub(super) fn drop_retired(&mut self, now: Instant) {
         while self.retired.front().is_some_and(|(until, _)| *until <= now) {
             self.retired.pop_front();

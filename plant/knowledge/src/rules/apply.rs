@@ -139,7 +139,7 @@ impl Rules {
     }
 }
 
-/// Reports that more statements follow than are stored, as `None`.
+/// Returns `None` and logs a warning if more statements follow than are stored.
 fn suspended<T>(found: Result<T, Stop>) -> Result<Option<T>, StorageError> {
     match found {
         Ok(found) => Ok(Some(found)),
@@ -147,7 +147,7 @@ fn suspended<T>(found: Result<T, Stop>) -> Result<Option<T>, StorageError> {
         Err(Stop::TooMany) => {
             tracing::warn!(
                 most = MAX_DERIVED,
-                "more statements follow by rules than are stored: the rules are suspended until the schema changes"
+                "the rules derive more statements than the limit: no rule is applied until the schema changes"
             );
             Ok(None)
         }
