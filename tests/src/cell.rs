@@ -17,6 +17,7 @@ use nix::{
 };
 
 use crate::mosquitto::{MOSQUITTO, MOSQUITTO_SUB};
+use crate::nats::NATS;
 
 /// Third-party software that a test needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,6 +43,8 @@ pub enum Peer {
     Tshark,
     /// The MQTT broker mosquitto and its command-line clients, from Debian or Ubuntu.
     Mosquitto,
+    /// nats-server, which speaks MQTT, from Debian or Ubuntu.
+    Nats,
 }
 
 /// A distribution of ROS 2 that is available as a peer.
@@ -260,6 +263,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
         Peer::NodeOpcua => &[&node_opcua],
         Peer::Tshark => &[Path::new(TSHARK)],
         Peer::Mosquitto => &[Path::new(MOSQUITTO), Path::new(MOSQUITTO_SUB)],
+        Peer::Nats => &[Path::new(NATS)],
     };
     match needed.iter().find(|path| !path.exists()) {
         None => Ok(()),

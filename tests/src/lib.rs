@@ -26,6 +26,7 @@ mod group_numbers;
 mod host;
 mod judge;
 mod mosquitto;
+mod nats;
 mod net;
 mod numbered;
 mod peers;
@@ -55,7 +56,8 @@ pub use executor::{Executes, Executor};
 pub use group_numbers::GroupNumbers;
 pub use host::{Cable, HERE, Host, THERE, WIRE, Wire};
 pub use judge::Judge;
-pub use mosquitto::BROKER;
+pub use mosquitto::{BROKER, Bridged};
+pub use nats::NatsCluster;
 pub use net::{
     GROUP, UadpSocket, all_overflowed, group_member, http_answer, http_get, metrics, overflowed,
     overflowed_outside_group, xml_rpc,

@@ -30,13 +30,30 @@ impl Cell {
     /// Panics if mosquitto does not start.
     #[must_use]
     pub fn mosquitto_with(&self, configuration: &str) -> Child {
+        self.mosquitto_named("mosquitto", configuration)
+    }
+
+    fn mosquitto_named(&self, name: &str, configuration: &str) -> Child {
         let text = format!("user root\nlog_dest stderr\n{configuration}");
-        let file = self.file("mosquitto.conf", &text);
+        let file = self.file(&format!("{name}.conf"), &text);
         let mut broker = Started::new("mosquitto", Path::new(MOSQUITTO))
             .args(["-v", "-c", file.to_str().unwrap()])
             .start();
         broker.wait_for_line("running", START);
         broker
+    }
+
+    /// Starts two brokers with a bridge between them, which forwards all messages of the space in
+    /// both directions.
+    #[must_use]
+    pub fn bridged(&self) -> Bridged<'_> {
+        let mut bridged = Bridged {
+            cell: self,
+            near: None,
+            far: None,
+        };
+        bridged.start();
+        bridged
     }
 
     /// Starts mosquitto_sub with these arguments. It prints a JSON object for each message, without
@@ -112,5 +129,53 @@ impl Cell {
                 "x509 -req -in {name}.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days 2 -extfile names.ext -out {name}.pem"
             ));
         }
+    }
+}
+
+/// Two brokers with a bridge between them.
+pub struct Bridged<'c> {
+    cell: &'c Cell,
+    near: Option<Child>,
+    far: Option<Child>,
+}
+
+impl Bridged<'_> {
+    /// The address of the broker that keeps the bridge.
+    pub const FAR: &'static str = "mqtt://127.0.0.1:1884";
+
+    /// Starts the brokers that do not run.
+    pub fn start(&mut self) {
+        self.near.get_or_insert_with(|| self.cell.mosquitto());
+        self.far.get_or_insert_with(|| {
+            // The session of the bridge ends with its connection, so nothing is queued for it.
+            let text = "listener 1884 127.0.0.1\nallow_anonymous true\n\
+                        connection near\naddress 127.0.0.1:1883\ntopic opcua/# both 1\n\
+                        bridge_protocol_version mqttv50\ncleansession true\nnotifications false\n\
+                        restart_timeout 1\n";
+            self.cell.mosquitto_named("far", text)
+        });
+    }
+
+    /// Kills the broker that keeps the bridge.
+    pub fn kill_far(&mut self) {
+        if let Some(far) = self.far.take() {
+            far.signal(Signal::SIGKILL);
+        }
+    }
+
+    /// Kills both brokers.
+    pub fn kill(&mut self) {
+        self.kill_far();
+        if let Some(near) = self.near.take() {
+            near.signal(Signal::SIGKILL);
+        }
+    }
+
+    /// Sends the broker that keeps the bridge a signal.
+    ///
+    /// # Panics
+    /// Panics if the broker does not run.
+    pub fn signal_far(&self, signal: Signal) {
+        self.far.as_ref().unwrap().signal(signal);
     }
 }

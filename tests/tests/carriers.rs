@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 use bridge_node::carrier_rules;
 use broker::{Identity, Mqtt};
 use mappings::{Broker, BrokerAddress, Mapping, MqttVersion, PubSub};
-use system_tests::{BROKER, Cell, Child, GROUP, HERE, Peer, UadpSocket, WIRE};
+use system_tests::{
+    BROKER, Bridged, Cell, Child, GROUP, HERE, NatsCluster, Peer, UadpSocket, WIRE,
+};
 use tokio::time::timeout;
 use transport::{BUFFER, Carrier, Carriers, Options, Outgoing, SendError, Udp};
 use uadp::{
@@ -62,13 +64,7 @@ struct Mosquitto<'c> {
 
 impl Network for Mosquitto<'_> {
     fn join(&self, publisher: u16) -> Box<dyn Carrier> {
-        let mut broker = Broker::new(BrokerAddress::parse(BROKER).unwrap());
-        broker.version = Some(self.version);
-        let identity = Identity {
-            program: "test".to_owned(),
-            publisher: Some(publisher),
-        };
-        Box::new(Mqtt::open(&broker, &identity).unwrap())
+        mqtt(BROKER, self.version, publisher)
     }
 
     fn cut(&mut self) {
@@ -77,6 +73,53 @@ impl Network for Mosquitto<'_> {
 
     fn mend(&mut self) {
         self.broker = Some(self.cell.mosquitto());
+    }
+}
+
+/// Joins a space at a broker.
+fn mqtt(address: &str, version: MqttVersion, publisher: u16) -> Box<dyn Carrier> {
+    let mut broker = Broker::new(BrokerAddress::parse(address).unwrap());
+    broker.version = Some(version);
+    let identity = Identity {
+        program: "test".to_owned(),
+        publisher: Some(publisher),
+    };
+    Box::new(Mqtt::open(&broker, &identity).unwrap())
+}
+
+/// Programs at different nodes of a cluster.
+impl Network for NatsCluster<'_> {
+    fn join(&self, publisher: u16) -> Box<dyn Carrier> {
+        let address = Self::address(publisher);
+        mqtt(&address, MqttVersion::V3_1_1, publisher)
+    }
+
+    fn cut(&mut self) {
+        self.kill_all();
+    }
+
+    fn mend(&mut self) {
+        self.start(&[]);
+    }
+}
+
+/// Programs at different brokers of a bridge.
+impl Network for Bridged<'_> {
+    fn join(&self, publisher: u16) -> Box<dyn Carrier> {
+        let address = if publisher.is_multiple_of(2) {
+            Self::FAR
+        } else {
+            BROKER
+        };
+        mqtt(address, MqttVersion::V5, publisher)
+    }
+
+    fn cut(&mut self) {
+        self.kill();
+    }
+
+    fn mend(&mut self) {
+        self.start();
     }
 }
 
@@ -403,6 +446,32 @@ fn mqtt_3_1_1_conforms() {
 #[test]
 fn mqtt_5_conforms() {
     mosquitto_conforms(MqttVersion::V5);
+}
+
+#[test]
+fn programs_at_three_nodes_of_nats_conform() {
+    let Some(cell) = Cell::with(&[Peer::Nats]) else {
+        return;
+    };
+    // A node disconnects a client that reads too slowly, and discards the rest of the flood.
+    let faults = Faults {
+        loses: true,
+        reorders: false,
+    };
+    run(conforms(&mut cell.nats("", &[]), faults));
+}
+
+#[test]
+fn programs_at_two_bridged_brokers_conform() {
+    let Some(cell) = Cell::with(&[Peer::Mosquitto]) else {
+        return;
+    };
+    // The bridge has a bounded queue.
+    let faults = Faults {
+        loses: true,
+        reorders: false,
+    };
+    run(conforms(&mut cell.bridged(), faults));
 }
 
 /// Returns the datagrams that a carrier receives from another host, up to `last`. Fails for an own

@@ -1,7 +1,9 @@
 //! The space over an MQTT broker: values, discovery, secured groups and TLS, commands that a broker
 //! could deliver late, and programs that forward between UDP and a broker.
 
-use std::path::Path;
+mod clusters;
+mod commanded;
+
 use std::process::Command;
 use std::time::Duration;
 
@@ -9,10 +11,12 @@ use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
     BROKER, Cell, Child, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, Peer, SERVER_ENDPOINT,
-    Started, eventually, holds_for, http_answer, metrics, program,
+    eventually, holds_for, http_answer, metrics, program,
 };
 use uadp::NetworkMessage;
 use uadp::discovery::{Announced, Announcement, ConnectionState};
+
+use commanded::{COMMAND, Commanded};
 
 const SOON: Duration = Duration::from_secs(30);
 const TOPIC: [&str; 2] = ["/ua_1_5_10", "std_msgs/String"];
@@ -155,106 +159,6 @@ fn delivered() -> u64 {
         .unwrap_or_default()
 }
 
-const COMMAND: &str = "
-pubsub: {address: \"mqtt://127.0.0.1:1883\"}
-namespaces: {2: urn:ua-bridge:system-tests}
-spaces: [{id: 1}]
-variables:
-  - node: ns=2;i=30
-    name: setpoint
-    type: Double
-    origin: 0
-    ros: {space: 1, topic: /arm/setpoint, type: std_msgs/Float64, field: data}
-server: {security: [None]}
-";
-
-/// A server and a robot of ROS 1 with a broker between them.
-struct Commanded<'c> {
-    cell: &'c Cell,
-    robot: Child,
-    value: f64,
-}
-
-impl Commanded<'_> {
-    fn write(&self, value: f64) -> Value {
-        let value = value.to_string();
-        let args = [SERVER_ENDPOINT, "ns=2;i=30", "Double", &value];
-        self.cell.asyncua_once("opcua_write.py", &args)[0]["status"].clone()
-    }
-
-    /// Writes new values until the robot confirms a value.
-    fn arrives(&mut self) {
-        eventually("a command is confirmed", SOON * 2, || {
-            self.value += 1.0;
-            (self.write(self.value) == "Good").then_some(())
-        });
-        let wanted = self.value;
-        self.robot.wait_for_json("the command", SOON, |line| {
-            (line.get("setpoint")?.as_f64()? == wanted).then_some(())
-        });
-    }
-
-    /// Checks that the robot does not get the value.
-    fn never_arrives(&self, value: f64) {
-        holds_for(
-            "the late command does not arrive",
-            Duration::from_secs(4),
-            || {
-                let lines = self.robot.json_lines();
-                let mut got = lines
-                    .iter()
-                    .filter_map(|line| line.get("setpoint")?.as_f64());
-                !got.any(|got| got == value)
-            },
-        );
-    }
-
-    /// Checks that a command that the broker delivers after its time is dropped and counted.
-    fn copy_is_dropped(&mut self) {
-        let mut copy = Started::new("mosquitto_sub", Path::new("/usr/bin/mosquitto_sub"))
-            .args([
-                "-h",
-                "127.0.0.1",
-                "-t",
-                "opcua/uadp/data/0/2/30",
-                "-C",
-                "1",
-                "-F",
-                "%x",
-            ])
-            .start();
-        eventually("a command is copied", SOON, || {
-            self.arrives();
-            (!copy.runs()).then_some(())
-        });
-        let hex = copy.lines().remove(0);
-        let bytes = (0..hex.len()).step_by(2);
-        let bytes: Vec<u8> = bytes
-            .map(|at| u8::from_str_radix(&hex[at..at + 2], 16).unwrap())
-            .collect();
-        let copied = self.cell.folder().join("command");
-        std::fs::write(&copied, bytes).unwrap();
-        let before = late();
-        eventually("the late command is counted", SOON, || {
-            let sent = Command::new("mosquitto_pub")
-                .args(["-h", "127.0.0.1", "-t", "opcua/uadp/data/0/2/30"])
-                .args(["-f", copied.to_str().unwrap()])
-                .status();
-            assert!(sent.unwrap().success());
-            (late() > before).then_some(())
-        });
-    }
-}
-
-/// Returns the number of late messages that the bridge dropped.
-fn late() -> u64 {
-    let status = metrics(METRICS_ROS1).unwrap_or_default();
-    let topics = status["topics"].as_object().into_iter().flatten();
-    let all = topics.map(|(_, topic)| topic).chain([&status["others"]]);
-    all.filter_map(|topic| topic["dropped"]["late"].as_u64())
-        .sum()
-}
-
 #[test]
 fn a_command_is_never_delivered_late_by_a_broker() {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Mosquitto]) else {
@@ -273,12 +177,7 @@ fn a_command_is_never_delivered_late_by_a_broker() {
         cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
     });
     let bridge = cell.bridge_ros1(&[mapping]);
-    let robot = cell.rospy("ros1_arm.py", &["/arm/setpoint", "/arm/reached"]);
-    let mut commanded = Commanded {
-        cell: &cell,
-        robot,
-        value: 0.0,
-    };
+    let mut commanded = Commanded::robot(&cell);
     commanded.arrives();
     commanded.copy_is_dropped();
 
@@ -456,12 +355,7 @@ fn a_command_crosses_from_udp_to_a_broker_and_is_never_late() {
     });
     let bridge = cell.bridge_ros1(&[over_mqtt]);
     let _between = cell.bridge_ros2(&[between.to_str().unwrap()]);
-    let robot = cell.rospy("ros1_arm.py", &["/arm/setpoint", "/arm/reached"]);
-    let mut commanded = Commanded {
-        cell: &cell,
-        robot,
-        value: 0.0,
-    };
+    let mut commanded = Commanded::robot(&cell);
     commanded.arrives();
 
     // The broker is stopped for a time in which its clients may stay.

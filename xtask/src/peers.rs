@@ -40,6 +40,8 @@ const APT: &[&str] = &[
     // The MQTT broker and its command-line clients.
     "mosquitto",
     "mosquitto-clients",
+    // A cluster of brokers that speak MQTT 3.1.1.
+    "nats-server",
     "iproute2",
     "valgrind",
     "python3-venv",

@@ -1,0 +1,256 @@
+//! More than one broker: a NATS cluster of three, of which a node is killed under load, and two
+//! mosquittos with a bridge.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use system_tests::{
+    BROKER, Bridged, Cell, Child, METRICS_ROS1, METRICS_ROS2, NatsCluster, Peer, SERVER_ENDPOINT,
+    Started, eventually, http_answer, metrics,
+};
+
+use super::commanded::{COMMAND, Commanded};
+use super::{SOON, TOPIC, delivered, space};
+
+/// Texts of a run, and their rate per second.
+const TEXTS: u32 = 1500;
+const RATE: &str = "100";
+
+/// Returns a mapping of a program at a broker, whose states are sent with QoS 1. A state may wait
+/// longer than the election of a new leader takes.
+fn states(cell: &Cell, name: &str, address: &str) -> String {
+    let text = format!(
+        "pubsub: {{address: \"{address}\", mqtt: {{qos: 1, within: 15s}}}}\nspaces: [{{id: 1}}, {{id: 2}}]\n"
+    );
+    cell.file(name, &text).to_str().unwrap().to_owned()
+}
+
+/// Waits until a program can send.
+fn is_ready(metrics: &str) {
+    eventually("the program is connected", SOON * 2, || {
+        let (code, _) = http_answer(metrics, "/readyz")?;
+        (code == 200).then_some(())
+    });
+}
+
+/// Starts the publisher of numbered texts in ROS 1 and the subscriber in ROS 2. The publisher sends
+/// `warm` until it is told to begin.
+fn numbered(cell: &Cell) -> (Child, Child) {
+    let mut receives = cell.cyclone("ros2_sub.py", &[&TOPIC[..], &["--domain", "2"]].concat());
+    let count = TEXTS.to_string();
+    let numbered = ["--numbered", &count, "--rate", RATE];
+    let warm_up = ["--warm-up", "\"warm\""];
+    let sends = cell
+        .rospy_started("ros1_pub.py", &[&TOPIC[..], &numbered, &warm_up].concat())
+        .told()
+        .start()
+        .ready(SOON);
+    receives.wait_for_json("the first text", SOON * 2, |line| {
+        line.get("value").map(drop)
+    });
+    (sends, receives)
+}
+
+/// Returns the numbers that arrived, in their order.
+fn arrived(receives: &Child) -> Vec<u32> {
+    let values = receives.values().into_iter();
+    values
+        .filter_map(|value| value["data"].as_str()?.parse().ok())
+        .collect()
+}
+
+/// Returns the number of states that a newer state replaced while they waited for the broker.
+fn replaced() -> u64 {
+    let status = metrics(METRICS_ROS1).unwrap_or_default();
+    status["broker"]["dropped"]["queue_replaced"]
+        .as_u64()
+        .unwrap_or_default()
+}
+
+/// Waits for the last text, and returns the longest time without a new one.
+fn largest_gap(receives: &Child) -> Duration {
+    let (mut last, mut count, mut gap) = (Instant::now(), delivered(), Duration::ZERO);
+    let wanted = TEXTS - 1;
+    eventually("the last text arrives", SOON * 3, || {
+        let now = delivered();
+        if now > count {
+            gap = gap.max(last.elapsed());
+            (last, count) = (Instant::now(), now);
+        }
+        arrived(receives).contains(&wanted).then_some(())
+    });
+    gap
+}
+
+#[test]
+fn no_state_is_lost_or_doubled_when_a_node_of_three_is_killed_under_load() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Nats]) else {
+        return;
+    };
+    let mut cluster = cell.nats("", &[]);
+    let _master = cell.roscore();
+    let [ros1, ros2] = [(0, "ros1.yaml"), (1, "ros2.yaml")]
+        .map(|(node, name)| states(&cell, name, &NatsCluster::address(node)));
+    let _bridges = (cell.bridge_ros1(&[&ros1]), cell.bridge_ros2(&[&ros2]));
+    is_ready(METRICS_ROS1);
+    is_ready(METRICS_ROS2);
+    let (mut sends, receives) = numbered(&cell);
+    sends.tell("begin");
+    eventually("a part of the texts arrives", SOON, || {
+        (arrived(&receives).len() > 200).then_some(())
+    });
+    cluster.kill(2);
+    let gap = largest_gap(&receives);
+    let got = arrived(&receives);
+    let different: BTreeSet<u32> = got.iter().copied().collect();
+    assert_eq!(different.len(), got.len(), "a text arrived twice");
+    assert!(got.is_sorted(), "a text arrived after a newer one");
+    let missing = u64::from(TEXTS) - u64::try_from(got.len()).unwrap();
+    let replaced = replaced();
+    eprintln!("largest gap {gap:?}, {missing} texts replaced by newer ones");
+    assert!(
+        missing <= replaced,
+        "{missing} missing, {replaced} replaced"
+    );
+}
+
+/// Starts a server and a bridge at different brokers.
+fn commanded(cell: &Cell, addresses: [&str; 2]) -> (Child, Child) {
+    let [server, bridge] =
+        [("server.yaml", addresses[0]), ("bridge.yaml", addresses[1])].map(|(name, address)| {
+            let file = cell.file(name, &COMMAND.replace(BROKER, address));
+            file.to_str().unwrap().to_owned()
+        });
+    let server = cell.ua_server(&[&server]);
+    eventually("the server answers clients", SOON, || {
+        cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
+    });
+    (server, cell.bridge_ros1(&[&bridge]))
+}
+
+#[test]
+fn a_command_over_a_cluster_is_never_late_when_nodes_stop_and_die() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Nats]) else {
+        return;
+    };
+    let mut cluster = cell.nats("", &[]);
+    let _master = cell.roscore();
+    let [first, second] = [0, 1].map(NatsCluster::address);
+    let _programs = commanded(&cell, [&first, &second]);
+    let mut commanded = Commanded::robot(&cell);
+    commanded.arrives();
+
+    // The node of the bridge is stopped.
+    cluster.signal(1, Signal::SIGSTOP);
+    assert_eq!(commanded.write(1002.0), "BadTimeout");
+    cluster.signal(1, Signal::SIGCONT);
+    commanded.never_arrives(1002.0);
+    commanded.arrives();
+
+    // The third node dies: commands need no stored messages.
+    cluster.kill(2);
+    commanded.arrives();
+
+    // The node of the bridge dies.
+    cluster.kill(1);
+    assert_eq!(commanded.write(1005.0), "BadTimeout");
+    cluster.start(&[]);
+    commanded.never_arrives(1005.0);
+    commanded.arrives();
+}
+
+#[test]
+fn a_command_over_two_bridged_brokers_is_never_late() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Mosquitto]) else {
+        return;
+    };
+    let mut brokers = cell.bridged();
+    let _master = cell.roscore();
+    let _programs = commanded(&cell, [BROKER, Bridged::FAR]);
+    let mut commanded = Commanded::robot(&cell);
+    commanded.arrives();
+
+    brokers.signal_far(Signal::SIGSTOP);
+    assert_eq!(commanded.write(1002.0), "BadTimeout");
+    brokers.signal_far(Signal::SIGCONT);
+    commanded.never_arrives(1002.0);
+    commanded.arrives();
+
+    brokers.kill_far();
+    assert_eq!(commanded.write(1005.0), "BadTimeout");
+    brokers.start();
+    commanded.never_arrives(1005.0);
+    commanded.arrives();
+}
+
+#[test]
+fn values_cross_two_bridged_brokers_once() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Mosquitto]) else {
+        return;
+    };
+    let _brokers = cell.bridged();
+    let _master = cell.roscore();
+    let [ros1, ros2] = [("ros1.yaml", BROKER), ("ros2.yaml", Bridged::FAR)]
+        .map(|(name, address)| states(&cell, name, address));
+    let _bridges = (cell.bridge_ros1(&[&ros1]), cell.bridge_ros2(&[&ros2]));
+    let (mut sends, receives) = numbered(&cell);
+    sends.tell("begin");
+    let _gap = largest_gap(&receives);
+    assert_eq!(arrived(&receives), (0..TEXTS).collect::<Vec<_>>());
+    let status = metrics(METRICS_ROS2).unwrap();
+    assert_eq!(status["topics"]["ua_1_5_10"]["sender_changed"], 0);
+}
+
+#[test]
+fn generated_permissions_of_nats_keep_a_space_from_sending_in_the_name_of_another() {
+    let Some(cell) = Cell::with(&[Peer::Nats, Peer::Mosquitto]) else {
+        return;
+    };
+    let address = NatsCluster::address(0);
+    let mapping = format!("pubsub: {{address: \"{address}\"}}\nspaces: [{{id: 1}}, {{id: 2}}]\n");
+    let mapping = cell.file("cell.yaml", &mapping);
+    let rules = space(&["acl", mapping.to_str().unwrap(), "--nats"]);
+    let users = ["space-0", "space-1", "space-2", "tools"];
+    let _cluster = cell.nats(&rules, &users);
+    // A message may cross to another node.
+    let at = |node: u16| ["-p".to_owned(), NatsCluster::port(node).to_string()];
+    let mut seen = Started::new("mosquitto_sub", "/usr/bin/mosquitto_sub".as_ref())
+        .args([
+            "-h",
+            "127.0.0.1",
+            "-u",
+            "tools",
+            "-P",
+            "word",
+            "-t",
+            "opcua/#",
+        ])
+        .args(at(1))
+        .args(["-F", r#"{"topic":"%t"}"#])
+        .ends_on(Signal::SIGINT)
+        .start();
+    let publish = |topic: &str| {
+        let sent = std::process::Command::new("mosquitto_pub")
+            .args(["-h", "127.0.0.1", "-u", "space-2", "-P", "word"])
+            .args(at(0))
+            .args(["-t", topic, "-m", topic])
+            .status();
+        assert!(sent.unwrap().success());
+    };
+    let has = |lines: &[Value], topic: &str| lines.iter().any(|line| line["topic"] == topic);
+    eventually("the own topic is allowed", SOON, || {
+        publish("opcua/uadp/data/1/5/10");
+        publish("opcua/uadp/data/2/5/10");
+        has(&seen.json_lines(), "opcua/uadp/data/2/5/10").then_some(())
+    });
+    publish("opcua/uadp/data/1/5/11");
+    publish("opcua/uadp/data/2/5/11");
+    seen.wait_for_json("the last message", SOON, |line| {
+        (line["topic"] == "opcua/uadp/data/2/5/11").then_some(())
+    });
+    let lines = seen.json_lines();
+    let forged = ["opcua/uadp/data/1/5/10", "opcua/uadp/data/1/5/11"];
+    assert!(!forged.iter().any(|topic| has(&lines, topic)), "{lines:?}");
+}
