@@ -35,6 +35,16 @@ pub struct Broker {
     pub client_id: Option<String>,
 }
 
+impl Broker {
+    /// Returns whether the text can be the first levels of every topic.
+    #[must_use]
+    pub fn is_prefix(text: &str) -> bool {
+        let is_plain = |c: char| !c.is_control() && !c.is_whitespace() && !matches!(c, '+' | '#');
+        let is_level = |level: &str| !level.is_empty() && !level.starts_with('$');
+        text.len() <= 128 && text.chars().all(is_plain) && text.split('/').all(is_level)
+    }
+}
+
 /// Version of MQTT.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MqttVersion {

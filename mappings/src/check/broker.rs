@@ -138,9 +138,7 @@ fn is_loopback(host: &str) -> bool {
 /// Reads levels of a topic.
 fn levels(field: &Field<String>, findings: &mut Findings) -> Option<String> {
     let (text, place) = given(field)?;
-    let is_plain = |c: char| !c.is_control() && !c.is_whitespace() && !matches!(c, '+' | '#');
-    let is_level = |level: &str| !level.is_empty() && !level.starts_with('$');
-    if text.len() <= 128 && text.chars().all(is_plain) && text.split('/').all(is_level) {
+    if Broker::is_prefix(text) {
         return Some(text.clone());
     }
     let message = format!("`{}` cannot be part of an MQTT topic", short(text));

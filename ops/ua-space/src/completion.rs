@@ -185,7 +185,7 @@ fn group(before: &[String]) -> Group {
     let mut words = vec!["ua-space".to_owned()];
     let mut rest = before.iter();
     while let Some(word) = rest.next() {
-        if ["--interface", "--address", "--keys"].contains(&word.as_str()) {
+        if ["--interface", "--address", "--cell", "--keys"].contains(&word.as_str()) {
             words.push(word.clone());
             words.extend(rest.next().cloned());
         } else if word == "--sign" {

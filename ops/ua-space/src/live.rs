@@ -7,6 +7,7 @@ mod bandwidth;
 pub(crate) mod book;
 mod call;
 mod carrier;
+mod cells;
 pub(crate) mod channels;
 mod copies;
 pub(crate) mod described;

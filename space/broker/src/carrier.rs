@@ -682,7 +682,7 @@ const fn message_type(kind: TopicMessageType) -> &'static str {
     clippy::disallowed_methods,
     reason = "the time of reports at the broker"
 )]
-fn utc() -> Timestamp {
+pub(crate) fn utc() -> Timestamp {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     let nanos = i128::try_from(since.unwrap_or_default().as_nanos()).unwrap_or_default();
     Timestamp::from_unix_nanos(nanos)

@@ -21,7 +21,6 @@ use crate::packets::{self, ConnectAck, PacketEvent, ReceivedPublish};
 use crate::queue::{QueuedPublish, SendQueue};
 use crate::settings::{BrokerSettings, random};
 use crate::stream::{BrokerStream, connect};
-use crate::topics;
 
 /// The state that the task shares with the carrier.
 #[derive(Debug, Default)]
@@ -163,6 +162,10 @@ struct Session<'a> {
     unanswered: Option<TokioInstant>,
     /// Packet identifiers of publications that the broker has not confirmed.
     unconfirmed: BTreeSet<u16>,
+    /// Whether the broker has accepted the connection.
+    accepted: Option<ConnectAck>,
+    /// Packet identifiers of subscriptions that the broker has not confirmed.
+    subscribing: BTreeSet<u16>,
     at: SocketAddr,
     refuses_version: bool,
     over: Option<String>,
@@ -195,6 +198,8 @@ impl<'a> Session<'a> {
             next_ping: TokioInstant::now() + PING,
             unanswered: None,
             unconfirmed: BTreeSet::new(),
+            accepted: None,
+            subscribing: BTreeSet::new(),
             at: SocketAddr::from(([0, 0, 0, 0], 0)),
             refuses_version: false,
             over: None,
@@ -218,8 +223,7 @@ impl<'a> Session<'a> {
             Ok(packet) => self.send(packet),
             Err(error) => return Ended::Lost(format!("cannot connect: {error:?}")),
         }
-        let accepted = TokioInstant::now() + ACCEPT;
-        let ended = self.exchange(&mut stream, received, accepted).await;
+        let ended = self.exchange(&mut stream, received).await;
         if let Ended::Closed = ended {
             self.finish(&mut stream).await;
         }
@@ -241,8 +245,8 @@ impl<'a> Session<'a> {
         &mut self,
         stream: &mut Box<dyn BrokerStream>,
         received: &mpsc::Sender<(ReceivedPublish, SocketAddr)>,
-        accepted: TokioInstant,
     ) -> Ended {
+        let begin = TokioInstant::now();
         let (mut reader, mut writer) = tokio::io::split(stream);
         let mut buffer = vec![0; READ];
         loop {
@@ -261,12 +265,17 @@ impl<'a> Session<'a> {
                 return Ended::Closed;
             }
             let connected = self.is_connected();
-            let timer = self.next_timer((!connected).then_some(accepted));
+            // A cluster may need seconds for each subscription.
+            let ready = match self.accepted {
+                None => begin + ACCEPT,
+                Some(_) => begin + SUBSCRIBE,
+            };
+            let timer = self.next_timer((!connected).then_some(ready));
             let pending = self.out.0.len() > self.out.1;
             tokio::select! {
                 read = reader.read(&mut buffer) => match read {
                     Ok(0) => {
-                        self.refuses_version = !connected;
+                        self.refuses_version = self.accepted.is_none();
                         return Ended::Lost("the broker closed the connection".to_owned());
                     }
                     Ok(length) => self.receive(buffer.get(..length).unwrap_or_default()),
@@ -280,7 +289,7 @@ impl<'a> Session<'a> {
                     }
                 }
                 () = sleep_until(timer) => {
-                    if !connected && TokioInstant::now() >= accepted {
+                    if !connected && TokioInstant::now() >= ready {
                         return Ended::Lost("the broker does not respond".to_owned());
                     }
                     self.fire();
@@ -290,14 +299,20 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Returns the time of the next timeout. `accepted` is set until the broker has accepted the
-    /// connection.
-    fn next_timer(&self, accepted: Option<TokioInstant>) -> TokioInstant {
+    /// Returns the time of the next timeout. `ready` is set until the broker has confirmed the
+    /// subscriptions.
+    fn next_timer(&self, ready: Option<TokioInstant>) -> TokioInstant {
         let timers = self.timers.values().map(|(_, at)| *at);
-        let stalled = self.unanswered.map(|since| since + STALL);
-        let ping = accepted.is_none().then_some(self.next_ping);
-        let all = timers.chain(stalled).chain(accepted).chain(ping);
+        let stalled = self.unanswered.map(|since| since + self.patience());
+        let ping = ready.is_none().then_some(self.next_ping);
+        let all = timers.chain(stalled).chain(ready).chain(ping);
         all.min().unwrap_or(self.next_ping)
+    }
+
+    /// Returns the time without an answer after which the broker is left. A message may take
+    /// `within`, and receivers drop later messages.
+    fn patience(&self) -> Duration {
+        STALL.max(self.settings.broker.within)
     }
 
     fn is_connected(&self) -> bool {
@@ -382,8 +397,9 @@ impl<'a> Session<'a> {
 
     fn fire(&mut self) {
         let now = TokioInstant::now();
-        if self.unanswered.is_some_and(|since| now >= since + STALL) {
-            let seconds = STALL.as_secs();
+        let patience = self.patience();
+        if self.unanswered.is_some_and(|since| now >= since + patience) {
+            let seconds = patience.as_secs();
             self.over = Some(format!("no response from the broker for {seconds} s"));
             return;
         }
@@ -417,6 +433,7 @@ impl<'a> Session<'a> {
                 GenericEvent::NotifyPacketReceived(packet) => self.packet(packet),
                 GenericEvent::NotifyPacketIdReleased(id) => {
                     self.unconfirmed.remove(&id);
+                    self.subscribing.remove(&id);
                 }
                 GenericEvent::RequestTimerReset { kind, duration_ms } => {
                     let at = TokioInstant::now() + Duration::from_millis(duration_ms);
@@ -444,25 +461,48 @@ impl<'a> Session<'a> {
                 self.over = Some(why);
             }
             PacketEvent::Message(message) => self.messages.push(message),
-            PacketEvent::NotSubscribed => warn!(
-                "the broker refuses a subscription: allow the client to read the topics of its prefix"
-            ),
+            PacketEvent::Subscribed { refused } => self.subscribed(refused),
             PacketEvent::Ended(why) => self.over = Some(why),
             PacketEvent::Other => {}
         }
     }
 
-    fn accepted(&mut self, ConnectAck { max_packet }: ConnectAck) {
-        let broker = &self.settings.broker;
-        for filter in topics::filters(broker) {
+    fn accepted(&mut self, accepted: ConnectAck) {
+        self.accepted = Some(accepted);
+        for filter in &self.settings.filters {
             let Ok(id) = self.protocol.acquire_packet_id() else {
                 return;
             };
-            match packets::subscribe(&filter, (self.version, id, broker.at_least_once)) {
+            self.subscribing.insert(id);
+            match packets::subscribe(filter, (self.version, id)) {
                 Ok(packet) => self.send(packet),
-                Err(error) => warn!(?error, filter, "cannot subscribe at the broker"),
+                Err(error) => {
+                    self.subscribing.remove(&id);
+                    warn!(
+                        ?error,
+                        filter = filter.name,
+                        "cannot subscribe at the broker"
+                    );
+                }
             }
         }
+    }
+
+    /// Counts a subscription that the broker has confirmed or refused. After the last, messages
+    /// are sent.
+    fn subscribed(&mut self, refused: bool) {
+        if refused {
+            warn!(
+                "the broker refuses a subscription: allow the client to read the topics of its prefix"
+            );
+        }
+        let Some(ConnectAck { max_packet }) = self.accepted else {
+            return;
+        };
+        if !self.subscribing.is_empty() || self.is_connected() {
+            return;
+        }
+        self.next_ping = TokioInstant::now() + PING;
         let mut state = self.shared.state();
         state.connections += 1;
         state.queue.discard();
@@ -477,7 +517,8 @@ impl<'a> Session<'a> {
             version: self.version,
             max_packet,
         };
-        info!(broker = %broker.address, version = ?self.version, "connected to the MQTT broker");
+        let broker = &self.settings.broker.address;
+        info!(%broker, version = ?self.version, "connected to the MQTT broker");
     }
 
     /// Ends the session in order: the broker discards the will, and everything written arrives.
@@ -516,12 +557,14 @@ pub(crate) fn instant() -> Instant {
     TokioInstant::now().into_std()
 }
 
-/// The time without an answer after which a broker is left.
+/// The time without an answer after which a broker is left, or `within` if it is longer.
 pub const STALL: Duration = Duration::from_secs(3);
 /// The interval of pings.
 const PING: Duration = Duration::from_secs(1);
 /// The time for the acceptance of a connection.
 const ACCEPT: Duration = Duration::from_secs(5);
+/// The time for the acceptance of a connection and its subscriptions.
+const SUBSCRIBE: Duration = Duration::from_secs(30);
 /// The time for the orderly end of a connection.
 const FINISH: Duration = Duration::from_secs(1);
 /// The first and the longest pause before a reconnection.

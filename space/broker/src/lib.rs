@@ -18,6 +18,7 @@
 
 mod address;
 mod carrier;
+mod cells;
 mod connection;
 mod echo;
 mod json;
@@ -31,6 +32,7 @@ mod stream;
 mod topics;
 
 pub use carrier::Mqtt;
+pub use cells::{CellStatus, CellWatch};
 pub use connection::STALL;
 pub use scope::{MessageRole, MessageScope, scope};
 pub use settings::{Identity, OpenError};

@@ -10,6 +10,7 @@ use mqtt_protocol_core::mqtt::result_code::MqttError;
 
 use crate::queue::QueuedPublish;
 use crate::settings::{BrokerSettings, Will};
+use crate::topics::TopicFilter;
 
 /// A received publication.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -71,10 +72,10 @@ pub(crate) fn connect(
 
 /// Returns the packet that subscribes a filter.
 pub(crate) fn subscribe(
-    filter: &str,
-    (version, id, confirmed): (MqttVersion, u16, bool),
+    TopicFilter { name, confirmed }: &TopicFilter,
+    (version, id): (MqttVersion, u16),
 ) -> Result<Packet, MqttError> {
-    let qos = if confirmed {
+    let qos = if *confirmed {
         Qos::AtLeastOnce
     } else {
         Qos::AtMostOnce
@@ -83,13 +84,13 @@ pub(crate) fn subscribe(
     Ok(match version {
         MqttVersion::V3_1_1 => v3_1_1::Subscribe::builder()
             .packet_id(id)
-            .entries(vec![SubEntry::new(filter, options)?])
+            .entries(vec![SubEntry::new(name, options)?])
             .build()?
             .into(),
         // Own messages are not returned.
         MqttVersion::V5 => v5_0::Subscribe::builder()
             .packet_id(id)
-            .entries(vec![SubEntry::new(filter, options.set_nl(true))?])
+            .entries(vec![SubEntry::new(name, options.set_nl(true))?])
             .build()?
             .into(),
     })
@@ -179,8 +180,10 @@ pub(crate) enum PacketEvent {
         version: bool,
     },
     Message(ReceivedPublish),
-    /// The broker refused a subscription.
-    NotSubscribed,
+    /// The broker confirmed or refused a subscription.
+    Subscribed {
+        refused: bool,
+    },
     Ended(String),
     Other,
 }
@@ -230,15 +233,15 @@ pub(crate) fn event(packet: Packet) -> PacketEvent {
             retained: packet.retain(),
         }),
         Packet::V3_1_1Suback(packet) => {
-            match packet.return_codes().iter().all(|code| code.is_success()) {
-                true => PacketEvent::Other,
-                false => PacketEvent::NotSubscribed,
+            let mut codes = packet.return_codes().iter();
+            PacketEvent::Subscribed {
+                refused: !codes.all(|code| code.is_success()),
             }
         }
         Packet::V5_0Suback(packet) => {
-            match packet.reason_codes().iter().all(|code| code.is_success()) {
-                true => PacketEvent::Other,
-                false => PacketEvent::NotSubscribed,
+            let mut codes = packet.reason_codes().iter();
+            PacketEvent::Subscribed {
+                refused: !codes.all(|code| code.is_success()),
             }
         }
         Packet::V5_0Disconnect(packet) => PacketEvent::Ended(format!(

@@ -100,7 +100,7 @@ impl Producers {
 }
 
 /// Returns the time until a status is overdue; `None` if it is.
-fn time_left(next: DateTime, utc: Timestamp) -> Option<Duration> {
+pub(crate) fn time_left(next: DateTime, utc: Timestamp) -> Option<Duration> {
     let next = Timestamp::from(next).unix_nanos() + MARGIN;
     let left = u64::try_from(next - utc.unix_nanos()).ok()?;
     Some(Duration::from_nanos(left))

@@ -13,7 +13,7 @@ use rustls::pki_types::{CertificateDer, InvalidDnsNameError, PrivateKeyDer, Serv
 use rustls::{ClientConfig, RootCertStore, crypto};
 
 use crate::reports::Reports;
-use crate::topics::{self, Address, TopicMessageType, UADP};
+use crate::topics::{self, Address, TopicFilter, TopicMessageType, UADP};
 
 /// The program that uses a broker.
 #[derive(Debug, Clone)]
@@ -61,6 +61,8 @@ pub(crate) struct BrokerSettings {
     pub(crate) credentials: Option<Credentials>,
     pub(crate) tls: Option<Tls>,
     pub(crate) will: Option<Will>,
+    /// The topics to subscribe, in their order.
+    pub(crate) filters: Vec<TopicFilter>,
 }
 
 /// The status that the broker publishes when the connection is lost.
@@ -92,6 +94,7 @@ impl BrokerSettings {
             credentials,
             tls,
             will: will(broker, identity),
+            filters: topics::filters(broker),
         })
     }
 }

@@ -170,23 +170,38 @@ pub(crate) fn parse(broker: &Broker, topic: &str) -> Option<ReceivedTopic> {
     })
 }
 
+/// A filter of topics to subscribe.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct TopicFilter {
+    pub(crate) name: String,
+    /// Whether the broker delivers messages with QoS 1. Only values are sent with it. NATS keeps a
+    /// replicated consumer for each such filter, which takes a second or more to create.
+    pub(crate) confirmed: bool,
+}
+
 /// Returns the filters of all messages of the space, in the order of subscription.
-pub(crate) fn filters(broker: &Broker) -> Vec<String> {
+pub(crate) fn filters(broker: &Broker) -> Vec<TopicFilter> {
     let prefix = &broker.prefix;
-    let mut filters: Vec<String> = TopicMessageType::ALL
+    let mut filters: Vec<TopicFilter> = TopicMessageType::ALL
         .into_iter()
         .flat_map(|kind| {
-            [UADP, JSON].map(|encoding| format!("{prefix}/{encoding}/{}/#", kind.level()))
+            [UADP, JSON].map(|encoding| TopicFilter {
+                name: format!("{prefix}/{encoding}/{}/#", kind.level()),
+                confirmed: broker.at_least_once && kind == TopicMessageType::Data,
+            })
         })
         .collect();
     if broker.topics == TopicForm::Names {
-        filters.push(format!("{prefix}/+"));
+        filters.push(TopicFilter {
+            name: format!("{prefix}/+"),
+            confirmed: broker.at_least_once,
+        });
     }
     filters
 }
 
 /// Reads a decimal id without leading zeros.
-fn number(level: &str) -> Option<u16> {
+pub(crate) fn number(level: &str) -> Option<u16> {
     let number: u16 = level.parse().ok()?;
     (number.to_string() == level).then_some(number)
 }
@@ -257,5 +272,19 @@ mod tests {
         }
         let named = parse(&broker, "opcua/uadp/data/1/robots/arm").unwrap();
         assert_eq!((named.address.group, named.address.writer), (None, None));
+    }
+
+    #[test]
+    fn only_values_are_subscribed_with_qos_1() {
+        let mut names = broker(TopicForm::Names);
+        assert!(filters(&names).iter().all(|filter| !filter.confirmed));
+        names.at_least_once = true;
+        let confirmed: Vec<String> = filters(&names)
+            .into_iter()
+            .filter(|filter| filter.confirmed)
+            .map(|filter| filter.name)
+            .collect();
+        let data = ["opcua/uadp/data/#", "opcua/json/data/#", "opcua/+"];
+        assert_eq!(confirmed, data);
     }
 }

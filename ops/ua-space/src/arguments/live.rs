@@ -23,6 +23,10 @@ pub(crate) struct Group {
     /// prefix
     #[arg(long, value_name = "MAPPING", env = "UA_BROKER")]
     pub(crate) broker: Option<PathBuf>,
+    /// The cell at an MQTT broker: the prefix of its topics, as plant/cell-4. `list` also takes
+    /// plant/+, and lists the cells
+    #[arg(long, value_name = "PREFIX", env = "UA_CELL")]
+    pub(crate) cell: Option<String>,
     /// The keys of a secured group, in the format of `ua-space keys` and `decode`: messages are
     /// decrypted with them, and requests are secured with the first
     #[arg(long, value_name = "FILE", env = "UA_KEYS")]

@@ -16,6 +16,11 @@ use crate::survey::look;
 
 /// Runs `ua-space list`.
 pub(crate) fn list(arguments: &List) -> Result<(), Failure> {
+    if let Some(cells) = arguments.group.cell.as_deref()
+        && cells.contains('+')
+    {
+        return super::cells::list(arguments, cells);
+    }
     look(async {
         let (programs, mut groups) = found(arguments).await?;
         let elsewhere = elsewhere(arguments, &programs);

@@ -20,9 +20,10 @@ pub(super) fn open_with_own(group: &Group) -> Result<(Box<dyn Carrier>, String),
     open_as(group, true)
 }
 
-fn open_as(group: &Group, own: bool) -> Result<(Box<dyn Carrier>, String), Failure> {
+/// Returns the broker of the command line; `None` for a group.
+pub(super) fn broker(group: &Group) -> Result<Option<Broker>, Failure> {
     let settings = group.broker.as_deref().map(settings).transpose()?;
-    let broker = match &group.address {
+    Ok(match &group.address {
         Some(url) if BrokerAddress::is_mqtt(url) => {
             let address = BrokerAddress::parse(url).ok_or_else(|| {
                 let example = BrokerAddress::EXAMPLE;
@@ -38,8 +39,19 @@ fn open_as(group: &Group, own: bool) -> Result<(Box<dyn Carrier>, String), Failu
         }
         Some(_) => None,
         None => settings,
-    };
-    if let Some(broker) = broker {
+    })
+}
+
+fn open_as(group: &Group, own: bool) -> Result<(Box<dyn Carrier>, String), Failure> {
+    if let Some(mut broker) = broker(group)? {
+        if let Some(cell) = &group.cell {
+            if !Broker::is_prefix(cell) {
+                return Err(Failure::Usage(format!(
+                    "--cell {cell}: not the prefix of a cell; for example plant/cell-4"
+                )));
+            }
+            broker.prefix.clone_from(cell);
+        }
         let identity = Identity {
             program: "ua-space".to_owned(),
             publisher: None,
@@ -47,6 +59,9 @@ fn open_as(group: &Group, own: bool) -> Result<(Box<dyn Carrier>, String), Failu
         let mqtt = Mqtt::open(&broker, &identity)
             .map_err(|error| Failure::Usage(format!("MQTT: {error}")))?;
         return Ok((Box::new(mqtt), broker.address.to_string()));
+    }
+    if group.cell.is_some() {
+        return Err(Failure::Usage(NO_BROKER.to_owned()));
     }
     let address = match &group.address {
         None => PubSub::ADDRESS,
@@ -65,6 +80,10 @@ fn open_as(group: &Group, own: bool) -> Result<(Box<dyn Carrier>, String), Failu
     let udp = Udp::open(&options).map_err(|error| Failure::Unavailable(error.to_string()))?;
     Ok((Box::new(udp), address.to_string()))
 }
+
+/// The failure of `--cell` without a broker.
+pub(super) const NO_BROKER: &str =
+    "--cell needs a broker: --address mqtt://broker.local:1883, or --broker MAPPING";
 
 /// Returns the broker of a mapping.
 fn settings(path: &Path) -> Result<Broker, Failure> {

@@ -47,6 +47,7 @@ fn same(group: &Group) -> Group {
         interface: group.interface.clone(),
         address: group.address.clone(),
         broker: group.broker.clone(),
+        cell: group.cell.clone(),
         keys: group.keys.clone(),
         sign: group.sign,
     }
