@@ -60,6 +60,17 @@ pub(crate) fn redundancy(workspace: &Workspace, arguments: &[&str]) -> anyhow::R
     measured(workspace, "bench-redundancy", &packages, arguments)
 }
 
+/// Runs all programs of a cell for hours with random faults.
+pub(crate) fn soak(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    let packages = [links::TARGET, "bridge-ros1", "bridge-ros2", "system-tests"];
+    measured(workspace, "soak", &packages, arguments)
+}
+
+/// Measures many cells at one broker.
+pub(crate) fn plant(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    measured(workspace, "bench-plant", &["system-tests"], arguments)
+}
+
 /// Measures the response times of skills, and a server with many skills.
 pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     measured(

@@ -44,6 +44,7 @@ cargo xtask <verb>
   docs [--check] [--no-build]    build the programs and write docs/reference from them; or only check that its pages are current
   patches [--test]               only patch the crates of patches/, which all verbs build with, and print the flags to do so by hand;
                                  or run the tests that the patches add, which `test` leaves out
+  soak [HOURS]                   run all programs of a cell with a random fault each minute, 2 hours unless told
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
@@ -52,6 +53,7 @@ cargo xtask <verb>
   bench opcua [ARGS]             measure ua-server beside servers of asyncua and node-opcua, and what comes from the space to clients
   bench redundancy [FAULTS]      measure the gaps of random faults of two redundant bridges at 1 kHz, 200 unless told
   bench knowledge [ARGS]         measure manifests, NodeSets, questions, the journal and plans of the knowledge of the plant
+  bench plant [CELLS]            measure many cells at one MQTT broker, 100 cells of 1000 topics unless told
   bench skills [ARGS]            measure what clients wait for of skills and of servers that are plugged in (finding)
   bench charts [--check]         draw the pictures of docs/benchmarks.md from its tables; or only check that they are current
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
@@ -103,6 +105,8 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["bench", "knowledge", rest @ ..] => bench::knowledge(&Workspace::find()?, rest),
         ["bench", "opcua", rest @ ..] => bench::opcua(&Workspace::find()?, rest),
         ["bench", "redundancy", rest @ ..] => bench::redundancy(&Workspace::find()?, rest),
+        ["soak", rest @ ..] => bench::soak(&Workspace::find()?, rest),
+        ["bench", "plant", rest @ ..] => bench::plant(&Workspace::find()?, rest),
         ["bench", "skills", rest @ ..] => bench::skills(&Workspace::find()?, rest),
         ["bench", "ros2", rest @ ..] => bench::ros2(&Workspace::find()?, rest),
         _ => {

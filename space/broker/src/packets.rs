@@ -233,15 +233,15 @@ pub(crate) fn event(packet: Packet) -> PacketEvent {
             retained: packet.retain(),
         }),
         Packet::V3_1_1Suback(packet) => {
-            let mut codes = packet.return_codes().iter();
+            let codes = packet.return_codes();
             PacketEvent::Subscribed {
-                refused: !codes.all(|code| code.is_success()),
+                refused: !codes.iter().all(|code| code.is_success()),
             }
         }
         Packet::V5_0Suback(packet) => {
-            let mut codes = packet.reason_codes().iter();
+            let codes = packet.reason_codes();
             PacketEvent::Subscribed {
-                refused: !codes.all(|code| code.is_success()),
+                refused: !codes.iter().all(|code| code.is_success()),
             }
         }
         Packet::V5_0Disconnect(packet) => PacketEvent::Ended(format!(
