@@ -330,6 +330,11 @@ document! {
         /// newest is sent after the period.
         #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)? ?Hz$"))]
         at_most: String,
+        /// The longest time between two values of a periodic value, such as 100ms. Each program
+        /// counts longer times (`deadline_missed`), and the server shows the value as uncertain
+        /// after this time, unless `quality` has another.
+        #[schemars(regex(pattern = DURATION))]
+        deadline: String,
         /// Age limits after which the server no longer shows the value as good.
         quality: QualityEntry,
         /// Values that raise an alarm at the server, such as {high: 70, high_high: 90} or {normal:

@@ -13,6 +13,8 @@ pub struct Ages {
     pub uncertain_after: Option<Duration>,
     /// The value is bad if it has been uncertain for this long; `None` for never.
     pub bad_after: Option<Duration>,
+    /// The longest time between two values, which each program checks; `None` for no limit.
+    pub deadline: Option<Duration>,
 }
 
 impl Ages {

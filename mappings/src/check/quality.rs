@@ -1,5 +1,7 @@
 //! Maximum ages of values.
 
+use std::time::Duration;
+
 use super::network;
 use crate::code::Code;
 use crate::document::VariableEntry;
@@ -8,6 +10,7 @@ use crate::mapping::Publish;
 use crate::quality::Ages;
 use crate::read::given;
 use crate::topic::SpaceId;
+use crate::tree::Place;
 
 /// Returns `None` for a faulty entry, which is noted.
 pub(super) fn check(
@@ -16,11 +19,17 @@ pub(super) fn check(
     publish: Option<&Publish>,
     findings: &mut Findings,
 ) -> Option<Ages> {
+    let deadline = deadline(entry, publish, findings)?;
+    let is_by_clients = origin == Some(SpaceId::UA) && entry.from.is_none();
     let Some(at) = &entry.quality else {
-        return Some(Ages::default());
+        return Some(Ages {
+            uncertain_after: deadline.filter(|_| !is_by_clients),
+            deadline,
+            ..Ages::default()
+        });
     };
     let said = at.value.as_ref()?;
-    if origin == Some(SpaceId::UA) && entry.from.is_none() {
+    if is_by_clients {
         findings
             .error(
                 Code::Quality,
@@ -33,6 +42,7 @@ pub(super) fn check(
     let ages = Ages {
         uncertain_after: network::duration(&said.uncertain_after, findings),
         bad_after: network::duration(&said.bad_after, findings),
+        deadline,
     };
     let faulty = (said.uncertain_after.is_some() && ages.uncertain_after.is_none())
         || (said.bad_after.is_some() && ages.bad_after.is_none());
@@ -43,8 +53,38 @@ pub(super) fn check(
         ages.uncertain_after
             .zip(given(&said.uncertain_after).map(|(_, place)| place)),
     ) else {
-        return Some(ages);
+        let uncertain_after = ages.uncertain_after.or(deadline);
+        return Some(Ages {
+            uncertain_after,
+            ..ages
+        });
     };
+    is_frequent(publish, (after, place), "uncertain_after", findings).then_some(ages)
+}
+
+/// Reads the longest time between two values. Returns `None` for a faulty entry, which is noted.
+fn deadline(
+    entry: &VariableEntry,
+    publish: Option<&Publish>,
+    findings: &mut Findings,
+) -> Option<Option<Duration>> {
+    let Some((_, place)) = given(&entry.deadline) else {
+        return Some(None);
+    };
+    let limit = network::duration(&entry.deadline, findings)?;
+    let fits =
+        publish.is_none_or(|publish| is_frequent(publish, (limit, place), "deadline", findings));
+    fits.then_some(Some(limit))
+}
+
+/// Returns whether values are sent more often than after a time. Values that are sent only on
+/// change are a warning.
+fn is_frequent(
+    publish: &Publish,
+    (after, place): (Duration, Place),
+    key: &str,
+    findings: &mut Findings,
+) -> bool {
     if publish.on_change {
         findings
             .warning(
@@ -52,7 +92,9 @@ pub(super) fn check(
                 place,
                 "the value is sent only on change, so an unchanged value is considered stale",
             )
-            .help("remove `publish: on_change` and `deadband`, or `uncertain_after`");
+            .help(format!(
+                "remove `publish: on_change` and `deadband`, or `{key}`"
+            ));
     } else if publish.period >= after {
         let message = format!(
             "a value is sent at most every {:?}, but considered stale after {after:?}",
@@ -61,7 +103,7 @@ pub(super) fn check(
         findings
             .error(Code::Quality, place, message)
             .help("use a longer time, or remove `at_most`");
-        return None;
+        return false;
     }
-    Some(ages)
+    true
 }

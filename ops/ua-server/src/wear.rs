@@ -184,6 +184,7 @@ mod tests {
         Wear::new(Ages {
             uncertain_after: uncertain.map(seconds),
             bad_after: bad.map(seconds),
+            ..Ages::default()
         })
     }
 

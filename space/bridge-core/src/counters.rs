@@ -317,6 +317,8 @@ pub struct Counters {
     pub keep_alives: u64,
     /// Changes of the source address of values of another space.
     pub sender_changed: u64,
+    /// Values that came later than the deadline after the value before.
+    pub deadline_missed: u64,
     /// The drops by cause, sorted. A list, because most topics have few causes.
     dropped: Vec<(Cause, u64)>,
 }
@@ -390,6 +392,7 @@ impl Counters {
             described,
             keep_alives,
             sender_changed,
+            deadline_missed,
             dropped,
         } = other;
         self.sent += sent;
@@ -400,6 +403,7 @@ impl Counters {
         self.described += described;
         self.keep_alives += keep_alives;
         self.sender_changed += sender_changed;
+        self.deadline_missed += deadline_missed;
         for (Cause { reason, .. }, count) in dropped {
             // A separate case, so that the inherited total does not delay the log entries of other
             // cases.

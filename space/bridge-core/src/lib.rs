@@ -22,6 +22,7 @@ mod call_plan;
 mod confirm;
 mod constant;
 mod counters;
+mod deadline;
 mod description;
 mod fields;
 mod gate;

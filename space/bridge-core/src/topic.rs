@@ -11,6 +11,7 @@ use crate::by_name::ByName;
 use crate::call::ValueDescription;
 use crate::confirm::Confirming;
 use crate::counters::Counters;
+use crate::deadline::Deadline;
 use crate::description::Description;
 use crate::gate::Gate;
 use crate::loss::{Loss, Stop};
@@ -45,6 +46,8 @@ pub(crate) struct Topic {
     pub(crate) lasting: Lasting,
     /// The selection of fields from messages of another space.
     pub(crate) takes: Takes,
+    /// The longest time between two values.
+    pub(crate) deadline: Option<Box<Deadline>>,
     /// The maximum time for which the writer may hold back a sample because of its rate limit.
     pub(crate) held_back: Duration,
     /// The reaction to the loss of the commander.
@@ -105,6 +108,14 @@ impl Item {
 }
 
 impl Topic {
+    /// Notes a value that is sent or delivered.
+    pub(crate) fn note_value(&mut self, now: Instant) {
+        let deadline = self.deadline.as_mut();
+        if deadline.is_some_and(|deadline| deadline.note(now)) {
+            self.counters.deadline_missed += 1;
+        }
+    }
+
     pub(crate) fn new(role: Role, (overflow, lasting): (Overflow, Lasting)) -> Self {
         Self {
             role,
@@ -117,6 +128,7 @@ impl Topic {
             overflow,
             lasting,
             takes: Takes::default(),
+            deadline: None,
             held_back: Duration::ZERO,
             loss: None,
             trigger: None,

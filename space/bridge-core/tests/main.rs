@@ -24,6 +24,7 @@ mod call_freedom;
 mod call_safety;
 mod calls;
 mod confirm;
+mod deadline;
 mod events;
 mod fields;
 mod foreign;

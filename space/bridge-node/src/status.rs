@@ -134,6 +134,8 @@ struct TopicStatus {
     keep_alives: u64,
     missing: u64,
     sender_changed: u64,
+    /// Values that came later than the deadline of the mapping.
+    deadline_missed: u64,
     /// Own datagrams that the group looped back, and values that the local side received from
     /// itself. They are not drops.
     looped: u64,
@@ -395,6 +397,7 @@ impl Told for Status {
             line("keep_alives_total", &labels, &status.keep_alives);
             line("messages_missing_total", &labels, &status.missing);
             line("sender_changed_total", &labels, &status.sender_changed);
+            line("deadline_missed_total", &labels, &status.deadline_missed);
             line("samples_looped_total", &labels, &status.looped);
             for (reason, count) in &status.dropped {
                 line(
@@ -546,6 +549,7 @@ impl From<&Counters> for TopicStatus {
             keep_alives: counters.keep_alives,
             missing: counters.missing,
             sender_changed: counters.sender_changed,
+            deadline_missed: counters.deadline_missed,
             looped: counters.dropped(Reason::Looped),
             dropped: counters
                 .drops()

@@ -1,5 +1,7 @@
 //! Datagrams with several DataSetMessages.
 
+use std::time::Instant;
+
 use mappings::{Overflow, TopicId};
 
 use super::about::About;
@@ -20,7 +22,7 @@ impl Values {
         // Each topic of a broker has its own messages. A message of several writers has the time of
         // its transmission.
         let others = match self.relay.is_some() || self.keeps_time(at) {
-            false => self.gather(topic, &first),
+            false => self.gather(topic, &first, now.monotonic),
             true => Vec::new(),
         };
         let with = others.iter().map(|(topic, _)| *topic).collect();
@@ -55,7 +57,7 @@ impl Values {
 
     /// Takes samples that fit into the datagram of `first` from the ready topics in their order.
     /// Other topics keep their position.
-    fn gather(&mut self, topic: TopicId, first: &Encoded) -> Vec<(TopicId, Encoded)> {
+    fn gather(&mut self, topic: TopicId, first: &Encoded, now: Instant) -> Vec<(TopicId, Encoded)> {
         let mut gathered = Vec::new();
         let seals = self.seals();
         let pubsub = self.mapping.pubsub();
@@ -88,6 +90,9 @@ impl Values {
             };
             let taken = taken.map(|taken| {
                 let repeated = entry.counters.repeated != before;
+                if !repeated {
+                    entry.note_value(now);
+                }
                 entry.counters.sent += 1;
                 entry.ready = entry.has_more();
                 (taken, entry.ready, repeated)

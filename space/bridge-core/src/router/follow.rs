@@ -10,6 +10,7 @@ use super::values::MAX_STRAYS;
 use super::{About, Router, Values};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
+use crate::deadline::Deadline;
 use crate::gate::Gate;
 use crate::reader::Reader;
 use crate::settings::Now;
@@ -76,6 +77,7 @@ impl Values {
         let mut entry = Topic::new(role, rules);
         entry.takes = Takes::of(variable);
         entry.confirming = Confirming::of(variable);
+        entry.deadline = Deadline::of(variable);
         entry.held_back = variable
             .map(|found| found.publish.period)
             .unwrap_or_default();

@@ -8,6 +8,7 @@ use messages::Wire;
 use super::{About, Router, Values};
 use crate::confirm::Confirming;
 use crate::counters::Reason;
+use crate::deadline::Deadline;
 use crate::gate::Gate;
 use crate::queue::Queue;
 use crate::settings::{Local, Now};
@@ -61,6 +62,7 @@ impl Router {
             {
                 entry.takes = Takes::of(is);
                 entry.confirming = Confirming::of(is);
+                entry.deadline = Deadline::of(is);
                 entry.held_back = is.map(|is| is.publish.period).unwrap_or_default();
                 if let Role::Theirs(reader) = &mut entry.role {
                     // The selected field may have changed.

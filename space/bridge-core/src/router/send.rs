@@ -159,6 +159,9 @@ impl Values {
             None => (None, None),
         };
         let repeated = entry.counters.repeated != repeated;
+        if !repeated && (datagram.is_some() || delivery.is_some()) {
+            entry.note_value(now.monotonic);
+        }
         entry.ready = entry.has_more();
         if entry.ready {
             self.ready.push_back(at);
@@ -192,6 +195,7 @@ impl Values {
                 entry.sending = Some(Sending { message, offset });
             } else {
                 entry.counters.sent += 1;
+                entry.note_value(now.monotonic);
             }
         }
         let is_whole = entry.sending.is_none();
