@@ -34,6 +34,9 @@ pub struct UdpGroup {
     pub interface: Option<String>,
     /// Hops a multicast datagram may travel.
     pub ttl: u8,
+    /// Hosts that datagrams are sent to instead of `address`, which is then an address of this
+    /// host.
+    pub peers: Vec<SocketAddr>,
 }
 
 /// A space, a namespace of a space, or a topic: `ua_1`, `ua_1_2` or `ua_1_2_10`.

@@ -364,6 +364,8 @@ pub struct PubSub {
     pub interface: Option<String>,
     /// Hops a multicast datagram may travel; 1 stays on the link.
     pub ttl: u8,
+    /// Hosts that datagrams are sent to instead of `address`, for networks without multicast.
+    pub peers: Vec<SocketAddr>,
     /// Rule for the PublisherIds of a space.
     pub publisher_id: PublisherIdRule,
     /// A value that does not change is sent again after this time, which heals a lost datagram.
@@ -430,6 +432,7 @@ impl Default for PubSub {
             broker: None,
             interface: None,
             ttl: 1,
+            peers: Vec::new(),
             publisher_id: PublisherIdRule::Exact,
             key_frame_period: Duration::from_secs(1),
             keep_alive_period: Duration::from_secs(1),

@@ -1,5 +1,7 @@
 //! The list of carriers.
 
+use std::net::SocketAddr;
+
 use super::broker;
 use super::network::{address, interface, settings, ttl};
 use crate::broker::{Broker, BrokerAddress};
@@ -72,11 +74,13 @@ fn adopt(pubsub: &mut PubSub, carriers: Vec<ConfiguredCarrier>) {
         address,
         interface,
         ttl,
+        peers,
     }) = udp
     {
         pubsub.address = address;
         pubsub.interface = interface;
         pubsub.ttl = ttl;
+        pubsub.peers = peers;
     }
     pubsub.broker = carriers.iter().find_map(|carrier| match &carrier.medium {
         CarrierMedium::Mqtt(broker) => Some(broker.clone()),
@@ -161,12 +165,54 @@ fn udp_group(entry: &UdpEntry, findings: &mut Findings) -> Option<UdpGroup> {
     };
     let named = given(&entry.interface);
     let interface = named.and_then(|(text, place)| interface(text, place, findings));
+    let address = url?;
     Some(UdpGroup {
-        address: url?,
+        address,
         interface,
         ttl: ttl(&entry.ttl, findings).unwrap_or(1),
+        peers: peers(entry, address, findings),
     })
 }
+
+/// Reads the hosts that datagrams are sent to.
+fn peers(entry: &UdpEntry, own: SocketAddr, findings: &mut Findings) -> Vec<SocketAddr> {
+    let Some((listed, place)) = given(&entry.peers) else {
+        return Vec::new();
+    };
+    if own.ip().is_multicast() {
+        let message = "with `peers`, `address` is the address of this host and not of a group";
+        let note = findings.error(Code::Address, place, message);
+        note.help("address: opc.udp://10.0.0.1:4840");
+    }
+    if listed.len() > MOST_PEERS {
+        let message = format!(
+            "{} hosts, but at most {MOST_PEERS} are possible",
+            listed.len()
+        );
+        let note = findings.error(Code::Address, place, message);
+        note.help("use multicast, or a broker");
+    }
+    let mut peers: Vec<SocketAddr> = Vec::new();
+    for At { place, value } in listed {
+        let Some(text) = value else { continue };
+        match text.parse::<SocketAddr>() {
+            Ok(peer) if peer.is_ipv4() && peer.port() != 0 && !peer.ip().is_multicast() => {
+                if peer != own && !peers.contains(&peer) {
+                    peers.push(peer);
+                }
+            }
+            Ok(_) | Err(_) => {
+                let message = format!("`{}` is not the address and port of a host", short(text));
+                let note = findings.error(Code::Address, *place, message);
+                note.help("give an IPv4 address and a port, such as 10.0.0.2:4840");
+            }
+        }
+    }
+    peers
+}
+
+/// The most hosts that each datagram is sent to.
+const MOST_PEERS: usize = 64;
 
 fn listed_broker(entry: &MqttEntry, place: Place, findings: &mut Findings) -> Option<Box<Broker>> {
     let Some(at) = &entry.address else {

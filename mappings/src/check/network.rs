@@ -59,6 +59,7 @@ pub(super) fn settings(entry: &PubSubEntry, findings: &mut Findings) -> PubSub {
         broker,
         interface,
         ttl: ttl.unwrap_or(default.ttl),
+        peers: default.peers,
         publisher_id,
         key_frame_period: key_frame_period.unwrap_or(default.key_frame_period),
         keep_alive_period: keep_alive_period.unwrap_or(default.keep_alive_period),

@@ -28,6 +28,10 @@ document! {
         address: String,
         /// Name or address of the network interface. Default: the operating system chooses.
         interface: String,
+        /// Other hosts by address and port, such as [10.0.0.2:4840], for networks that carry
+        /// multicast badly: each datagram is sent to each of them. `address` is then the address
+        /// and port of this host.
+        peers: Vec<At<String>>,
         /// Hops a multicast datagram may travel. Default 1: it stays on the link.
         #[schemars(range(max = 255))]
         ttl: u16,

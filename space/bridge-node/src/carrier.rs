@@ -155,6 +155,10 @@ fn options(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Op
         address,
         interface: pubsub.interface.clone(),
         ttl: pubsub.ttl,
+        peers: match arguments.flags.address {
+            Some(_) => Vec::new(),
+            None => pubsub.peers.clone(),
+        },
     };
     udp_options(arguments, &group, several)
 }
@@ -165,11 +169,13 @@ fn udp_options(arguments: &Arguments, group: &UdpGroup, several: bool) -> Result
         address,
         interface,
         ttl,
+        peers,
     } = group;
     let flag = arguments.flags.interface.clone();
     let options = Options {
         interface: flag.or_else(|| interface.clone()),
         ttl: u32::from(*ttl),
+        peers: peers.clone(),
         ..Options::new(*address)
     };
     if several && !address.ip().is_multicast() {
