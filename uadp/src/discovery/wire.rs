@@ -199,7 +199,11 @@ macro_rules! structure {
                 })
             }
 
-            fn write(&self, out: &mut alloc::vec::Vec<u8>, _: &'static str) -> Result<(), crate::EncodeError> {
+            fn write(
+                &self,
+                out: &mut alloc::vec::Vec<u8>,
+                _: &'static str,
+            ) -> Result<(), crate::EncodeError> {
                 $( crate::discovery::wire::Structure::write(
                     &self.$field,
                     out,
@@ -244,7 +248,11 @@ macro_rules! enumeration {
                 reader.i32(what).map(Self)
             }
 
-            fn write(&self, out: &mut alloc::vec::Vec<u8>, _: &'static str) -> Result<(), crate::EncodeError> {
+            fn write(
+                &self,
+                out: &mut alloc::vec::Vec<u8>,
+                _: &'static str,
+            ) -> Result<(), crate::EncodeError> {
                 out.extend_from_slice(&self.0.to_le_bytes());
                 Ok(())
             }
