@@ -423,7 +423,8 @@ calls:
     let mut asker = cell.rclpy_asker(Distribution::Jazzy);
     let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
     let topic = "/ua_1_2_12";
-    judge.ask(json!({"subscribe": topic, "type": "std_msgs/msg/String", "qos": {"depth": 2000}}));
+    // The reader itself drops none of the values, even if it runs after the last one was sent.
+    judge.ask(json!({"subscribe": topic, "type": "std_msgs/msg/String", "qos": {"depth": 5000}}));
     let args = [
         topic,
         "std_msgs/String",
