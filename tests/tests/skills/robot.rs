@@ -100,8 +100,14 @@ fn a_client_that_knows_robots_sees_the_axes_the_speed_and_the_safety_state_of_a_
             .iter()
             .find(|line| line.get("axes").is_some())?
             .clone();
-        let is_measured = seen["speed"].is_number() && seen["axes"][0][1].is_number();
-        is_measured.then_some(seen)
+        // A value that has not arrived yet is the name of its status.
+        let axes = seen["axes"].as_array()?;
+        let has_axes = axes.iter().all(|axis| axis[1].is_number());
+        let safety = seen["safety"]["SafetyState"].as_object()?;
+        let has_safety = safety
+            .values()
+            .all(|value| value.is_boolean() || value.is_number());
+        (has_axes && has_safety && seen["speed"].is_number()).then_some(seen)
     });
     let axis = |number: usize| json!([format!("Axis_{number}"), 0.0, "rad", 1]);
     let axes: Vec<Value> = (1..=6).map(axis).collect();
