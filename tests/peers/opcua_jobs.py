@@ -54,7 +54,8 @@ async def run(url, process):
             lifetime.say(call=name, status=status, states=await states())
 
         async def ended(name):
-            while (await states())[name] == 3:
+            # 5 is Ended, 6 is Aborted.
+            while (await states())[name] not in (5, 6):
                 await asyncio.sleep(0.05)
 
         async def interrupted(name):
