@@ -263,7 +263,7 @@ fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Fai
         let spaces = "The ROS sides. 1 is ROS 1, others are DDS domains; 0, the OPC UA side, is always there.";
         section(&mut lines, spaces, "spaces", render::spaces(plan, "  "));
         lines.extend(render::network(plan));
-        let namespaces = "What the indexes in node ids mean. The URI counts: check --environment compares it with the server's.";
+        let namespaces = "The namespaces of the node ids. check --environment compares each URI with that of the server.";
         section(
             &mut lines,
             namespaces,
