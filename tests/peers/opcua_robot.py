@@ -57,7 +57,7 @@ async def measured(system):
     _, arm, _ = await only(system, "MotionDevices")
     children = await names(arm)
     axes = []
-    for name, axis in (await names(children["Axes"])).items():
+    for name, axis in sorted((await names(children["Axes"])).items()):
         below = await names(axis)
         position = (await names(below["ParameterSet"]))["ActualPosition"]
         unit = await (await names(position))["EngineeringUnits"].read_value()

@@ -18,8 +18,10 @@ use super::{SOON, delivered, space};
 const TEXTS: u32 = 1500;
 const RATE: &str = "100";
 
-/// The topic of the state `ua_1_5_10` in both ROS.
+/// The topic of the state in ROS 1, where it originates.
 const NUMBER: [&str; 2] = ["/number", "std_msgs/String"];
+/// Its topic in ROS 2, and the domain.
+const NUMBER_ROS2: [&str; 4] = ["/ua_1_5_10", "std_msgs/String", "--domain", "2"];
 
 /// Returns a mapping of a program at a broker, whose states are sent with QoS 1. A state may wait
 /// longer than the election of a new leader takes.
@@ -46,7 +48,7 @@ fn is_ready(metrics: &str) {
 /// Starts the publisher of numbered texts in ROS 1 and the subscriber in ROS 2. The publisher sends
 /// `warm` until it is told to begin.
 fn numbered(cell: &Cell) -> (Child, Child) {
-    let mut receives = cell.cyclone("ros2_sub.py", &[&NUMBER[..], &["--domain", "2"]].concat());
+    let mut receives = cell.cyclone("ros2_sub.py", &NUMBER_ROS2);
     let count = TEXTS.to_string();
     let numbered = ["--numbered", &count, "--rate", RATE];
     let warm_up = ["--warm-up", "\"warm\""];
