@@ -1,18 +1,15 @@
-//! More than one broker: a NATS cluster of three, of which a node is killed under load, and two
-//! mosquittos with a bridge.
-
-use std::collections::BTreeSet;
-use std::time::{Duration, Instant};
+//! More than one broker: a NATS cluster of three, whose nodes are stopped and killed beside commands,
+//! and two mosquittos with a bridge.
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{
     BROKER, Bridged, Cell, Child, METRICS_ROS1, METRICS_ROS2, NatsCluster, Peer, SERVER_ENDPOINT,
-    Started, eventually, http_answer, metrics,
+    Started, eventually, metrics,
 };
 
 use super::commanded::{COMMAND, Commanded};
-use super::{SOON, delivered, space};
+use super::{SOON, space};
 
 /// Texts of a run, and their rate per second.
 const TEXTS: u32 = 1500;
@@ -35,14 +32,6 @@ fn states(cell: &Cell, name: &str, address: &str) -> String {
          ros: {{topic: /number, type: std_msgs/String}}}}\n"
     );
     cell.file(name, &text).to_str().unwrap().to_owned()
-}
-
-/// Waits until a program can send.
-fn is_ready(metrics: &str) {
-    eventually("the program is connected", SOON * 2, || {
-        let (code, _) = http_answer(metrics, "/readyz")?;
-        (code == 200).then_some(())
-    });
 }
 
 /// Starts the publisher of numbered texts in ROS 1 and the subscriber in ROS 2. The publisher sends
@@ -79,51 +68,11 @@ fn replaced() -> u64 {
         .unwrap_or_default()
 }
 
-/// Waits for the last text, and returns the longest time without a new one.
-fn largest_gap(receives: &Child) -> Duration {
-    let (mut last, mut count, mut gap) = (Instant::now(), delivered(), Duration::ZERO);
-    let wanted = TEXTS - 1;
+/// Waits for the last text.
+fn ends(receives: &Child) {
     eventually("the last text arrives", SOON * 3, || {
-        let now = delivered();
-        if now > count {
-            gap = gap.max(last.elapsed());
-            (last, count) = (Instant::now(), now);
-        }
-        arrived(receives).contains(&wanted).then_some(())
+        arrived(receives).contains(&(TEXTS - 1)).then_some(())
     });
-    gap
-}
-
-#[test]
-fn no_state_is_lost_or_doubled_when_a_node_of_three_is_killed_under_load() {
-    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Nats]) else {
-        return;
-    };
-    let mut cluster = cell.nats("", &[]);
-    let _master = cell.roscore();
-    let [ros1, ros2] = [(0, "ros1.yaml"), (1, "ros2.yaml")]
-        .map(|(node, name)| states(&cell, name, &NatsCluster::address(node)));
-    let _bridges = (cell.bridge_ros1(&[&ros1]), cell.bridge_ros2(&[&ros2]));
-    is_ready(METRICS_ROS1);
-    is_ready(METRICS_ROS2);
-    let (mut sends, receives) = numbered(&cell);
-    sends.tell("begin");
-    eventually("a part of the texts arrives", SOON, || {
-        (arrived(&receives).len() > 200).then_some(())
-    });
-    cluster.kill(2);
-    let gap = largest_gap(&receives);
-    let got = arrived(&receives);
-    let different: BTreeSet<u32> = got.iter().copied().collect();
-    assert_eq!(different.len(), got.len(), "a text arrived twice");
-    assert!(got.is_sorted(), "a text arrived after a newer one");
-    let missing = u64::from(TEXTS) - u64::try_from(got.len()).unwrap();
-    let replaced = replaced();
-    eprintln!("largest gap {gap:?}, {missing} texts replaced by newer ones");
-    assert!(
-        missing <= replaced,
-        "{missing} missing, {replaced} replaced"
-    );
 }
 
 /// Starts a server and a bridge at different brokers.
@@ -207,7 +156,7 @@ fn values_cross_two_bridged_brokers_once() {
     let _bridges = (cell.bridge_ros1(&[&ros1]), cell.bridge_ros2(&[&ros2]));
     let (mut sends, receives) = numbered(&cell);
     sends.tell("begin");
-    let _gap = largest_gap(&receives);
+    ends(&receives);
     let got = arrived(&receives);
     assert!(got.windows(2).all(|pair| pair[0] < pair[1]), "{got:?}");
     let missing = u64::from(TEXTS) - u64::try_from(got.len()).unwrap();
