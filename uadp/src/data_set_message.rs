@@ -565,7 +565,8 @@ fn read_kind(kind: u8) -> Result<MessageKind, DecodeError> {
     }
 }
 
-/// Checks that the bytes behind the end of a message are zero, as padding to its ConfiguredSize.
+/// Checks that the bytes behind the end of a message are zero, as padding to its ConfiguredSize or
+/// to the shortest Ethernet frame.
 #[inline]
 pub(crate) fn check_padding(rest: &[u8]) -> Result<(), DecodeError> {
     match rest.iter().all(|byte| *byte == 0) {

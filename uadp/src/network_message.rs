@@ -1,6 +1,7 @@
 //! NetworkMessage: the headers of a datagram, and access to its DataSetMessages.
 
 use crate::action::{ActionDialect, Actions};
+use crate::data_set_message::check_padding;
 use crate::header::{self, Flags};
 use crate::reader::Reader;
 use crate::{
@@ -320,15 +321,17 @@ impl<'a> NetworkMessage<'a> {
         let message_sequence_number = payload.u16("MessageSequenceNumber")?;
         let offset = payload.u32("ChunkOffset")?;
         let total_size = payload.u32("TotalSize")?;
-        let data = payload.rest();
-        let end = u32::try_from(data.len())
-            .ok()
-            .and_then(|len| offset.checked_add(len));
-        if data.is_empty() || end.is_none_or(|end| end > total_size) {
-            return Err(DecodeError::Limit {
-                field: "ChunkOffset",
-                value: offset,
-            });
+        let exceeded = DecodeError::Limit {
+            field: "ChunkOffset",
+            value: offset,
+        };
+        let rest = payload.rest();
+        // The frame of a short last part may be padded.
+        let most = total_size.checked_sub(offset).ok_or(exceeded)?;
+        let most = usize::try_from(most).unwrap_or(usize::MAX);
+        let (data, padding) = rest.split_at(rest.len().min(most));
+        if data.is_empty() || check_padding(padding).is_err() {
+            return Err(exceeded);
         }
         Ok(Chunk {
             writer_id: self.writer_ids().and_then(|mut ids| ids.next()),
@@ -515,10 +518,7 @@ impl<'a> Messages<'a> {
         let (Some((writer_id, writer_ids)), Some((size, sizes))) =
             (writer_ids.split_first(), sizes.split_first())
         else {
-            return match self.payload.remaining() {
-                0 => None,
-                left => Some(Err(DecodeError::TrailingBytes(left))),
-            };
+            return check_padding(self.payload.rest()).err().map(Err);
         };
         let size = u16::from_le_bytes(*size).into();
         let message = match self.payload.bytes(size, "DataSetMessage") {

@@ -141,9 +141,12 @@ fn sizes_past_the_datagram_and_bytes_behind_the_last_message_are_errors() {
     let long = [0x41, 2, 1, 0, 2, 0, 1, 0, 9, 0, 0x01, 0x01];
     let errors: Vec<_> = messages(&long).into_iter().map(Result::err).collect();
     assert_eq!(errors, [None, Some(cut("DataSetMessage", 9, 1))]);
-    let short = [0x41, 2, 1, 0, 2, 0, 1, 0, 1, 0, 0x01, 0x01, 0];
+    let short = [0x41, 2, 1, 0, 2, 0, 1, 0, 1, 0, 0x01, 0x01, 7];
     let errors: Vec<_> = messages(&short).into_iter().map(Result::err).collect();
     assert_eq!(errors, [None, None, Some(DecodeError::TrailingBytes(1))]);
+    let padded = [0x41, 2, 1, 0, 2, 0, 1, 0, 1, 0, 0x01, 0x01, 0, 0];
+    let errors: Vec<_> = messages(&padded).into_iter().map(Result::err).collect();
+    assert_eq!(errors, [None, None]);
     let within = [0x41, 2, 1, 0, 2, 0, 1, 0, 1];
     let errors: Vec<_> = messages(&within).into_iter().map(Result::err).collect();
     assert_eq!(errors, [Some(cut("Sizes", 4, 3))]);
@@ -932,6 +935,9 @@ fn a_chunk_is_a_piece_that_lies_in_the_whole() {
         let chunk = NetworkMessage::decode(&datagram).unwrap().chunk();
         assert_eq!(chunk, Err(limit), "{offset} of {total}");
     }
+    let padded = datagram(8, 10, &[3, 4, 0, 0]);
+    let chunk = NetworkMessage::decode(&padded).unwrap().chunk().unwrap();
+    assert_eq!(chunk.data, [3, 4], "a short frame is padded");
     let short = NetworkMessage::decode(read.get(..14).unwrap()).unwrap();
     assert_eq!(short.chunk(), Err(cut("TotalSize", 4, 3)));
     let whole = NetworkMessage::decode(&[0x01, 0x01]).unwrap();

@@ -233,10 +233,9 @@ impl<'a> Iterator for Actions<'a> {
 
     fn next(&mut self) -> Option<Self::Item> {
         let Some((writer_id, writer_ids)) = self.writer_ids.split_first() else {
-            return match self.payload.take_rest().len() {
-                0 => None,
-                left => Some(Err(DecodeError::TrailingBytes(left))),
-            };
+            return message::check_padding(self.payload.take_rest())
+                .err()
+                .map(Err);
         };
         let writer_id = u16::from_le_bytes(*writer_id);
         let bytes = match self.sizes {

@@ -6,6 +6,7 @@ use super::list::List;
 use super::meta_data::DataSetMetaDataType;
 use super::wire::{Structure, enumeration, structure};
 use super::{read_payload, write_headers};
+use crate::data_set_message::check_padding;
 use crate::reader::Reader;
 use crate::{
     DateTime, DecodeError, EncodeError, LocalizedText, NetworkMessage, NetworkMessageType, NodeId,
@@ -165,19 +166,17 @@ impl<'a> Announcement<'a> {
     ///
     /// # Errors
     /// [`DecodeError::Reserved`] with the type of an unknown announcement. Otherwise fails if a
-    /// field is truncated or malformed, or if bytes follow the last field.
+    /// field is truncated or malformed, or if bytes other than padding follow the last field.
     pub fn decode_body(body: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(body);
         let announcement_type = reader.u8("AnnouncementType")?;
         let sequence_number = reader.u16("SequenceNumber")?;
         let announced = Announced::read(announcement_type, &mut reader)?;
-        match reader.remaining() {
-            0 => Ok(Self {
-                sequence_number,
-                announced,
-            }),
-            left => Err(DecodeError::TrailingBytes(left)),
-        }
+        check_padding(reader.rest())?;
+        Ok(Self {
+            sequence_number,
+            announced,
+        })
     }
 
     /// Appends the NetworkMessage, up to the end of its payload. Without security the header is

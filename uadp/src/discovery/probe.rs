@@ -3,6 +3,7 @@
 use super::list::List;
 use super::wire::Structure;
 use super::{read_payload, write_headers};
+use crate::data_set_message::check_padding;
 use crate::reader::Reader;
 use crate::{
     DecodeError, EncodeError, NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader,
@@ -65,7 +66,7 @@ impl<'a> Probe<'a> {
     ///
     /// # Errors
     /// [`DecodeError::Reserved`] with the type of an unknown probe. Otherwise fails if a field is
-    /// truncated or malformed, or if bytes follow the last field.
+    /// truncated or malformed, or if bytes other than padding follow the last field.
     pub fn decode_body(body: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(body);
         let probe = match reader.u8("ProbeType")? {
@@ -78,10 +79,8 @@ impl<'a> Probe<'a> {
                 });
             }
         };
-        match reader.remaining() {
-            0 => Ok(probe),
-            left => Err(DecodeError::TrailingBytes(left)),
-        }
+        check_padding(reader.rest())?;
+        Ok(probe)
     }
 
     fn read_publisher_information(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {

@@ -137,6 +137,9 @@ fn connections_are_an_array_without_a_status() {
         Announcement::decode_body(&[4, 1, 0, 0, 0, 0, 0, 9]),
         Err(DecodeError::TrailingBytes(1))
     );
+    let padded = Announcement::decode_body(&[4, 1, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(padded, Announcement::decode_body(&[4, 1, 0, 0, 0, 0, 0]));
+    assert!(padded.is_ok());
 }
 
 #[test]

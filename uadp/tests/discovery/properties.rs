@@ -522,7 +522,7 @@ proptest! {
         for len in 0..bytes.len() {
             prop_assert!(Announcement::decode_body(&bytes[..len]).is_err(), "{} of {}", len, bytes.len());
         }
-        bytes.push(0);
+        bytes.push(1);
         prop_assert!(Announcement::decode_body(&bytes).is_err());
     }
 
