@@ -260,7 +260,7 @@ field("uint32", "dataset.major_version", "ConfigurationVersion MajorVersion", ba
 field("uint32", "dataset.minor_version", "ConfigurationVersion MinorVersion", base.DEC)
 field("uint16", "dataset.field_count", "FieldCount", base.DEC)
 field("bytes", "dataset.raw_data", "RawData")
-field("bytes", "dataset.padding", "Padding to the ConfiguredSize")
+field("bytes", "dataset.padding", "Padding to the ConfiguredSize or to the shortest frame")
 field("bytes", "dataset.ignored", "Ignored")
 
 field("none", "field", "Field")
@@ -1148,6 +1148,19 @@ local function read_padding(ctx, cur, tree, sized)
     put(ctx, tree, "dataset.padding", range)
 end
 
+-- A short Ethernet frame ends with zeros.
+local function read_frame_padding(ctx, cur, tree, what)
+    local left = cur:left()
+    if left == 0 then
+        return
+    end
+    local range = cur:rest("Padding")
+    if range:raw():find("[^\0]") then
+        cur:problem(cur.pos - left, left, left .. " bytes behind " .. what)
+    end
+    put(ctx, tree, "dataset.padding", range)
+end
+
 local function count_of_fields(count)
     return count == 1 and " (1 field)" or string.format(" (%d fields)", count)
 end
@@ -1290,10 +1303,7 @@ local function dissect_dataset_messages(ctx, cur, tree, writer_ids)
         local what = "DataSetMessage of DataSetWriterId " .. writer_ids[number]
         dissect_dataset_message(ctx, cur:sub(size, what), tree, writer_ids[number], true)
     end
-    if cur:left() > 0 then
-        local left = cur:left()
-        cur:problem(cur.pos, left, left .. " bytes behind the last DataSetMessage")
-    end
+    read_frame_padding(ctx, cur, tree, "the last DataSetMessage")
 end
 
 -- Discovery (OPC 10000-14, 7.2.4.6)
@@ -1335,10 +1345,7 @@ local function dissect_probe(ctx, cur, tree)
             local words = read_probe(ctx, cur, item)
             say(item, ": " .. words)
             ctx.info[#ctx.info + 1] = "probe for " .. words
-            if cur:left() > 0 then
-                local left = cur:left()
-                cur:problem(cur.pos, left, left .. " bytes behind the probe")
-            end
+            read_frame_padding(ctx, cur, item, "the probe")
         end)
     end)
 end
@@ -1494,9 +1501,8 @@ local function read_announcement(ctx, cur, tree)
         words = words .. BODY[kind](ctx, cur, tree)
         ctx.info[#ctx.info] = "announcement " .. words
     end
-    if kind == 2 and cur:left() > 0 then
-        local left = cur:left()
-        cur:problem(cur.pos, left, left .. " bytes behind the announcement")
+    if kind == 2 then
+        read_frame_padding(ctx, cur, tree, "the announcement")
     elseif cur:left() > 0 then
         put(ctx, tree, "announcement.body", cur:rest("Body"))
     end
@@ -2074,4 +2080,6 @@ function uadp.prefs_changed()
 end
 
 udp:add(ports, uadp)
+-- UADP over Ethernet (OPC 10000-14, 7.3.3).
+DissectorTable.get("ethertype"):add(0xB62C, uadp)
 uadp:register_heuristic("udp", heuristic)
