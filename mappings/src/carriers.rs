@@ -1,13 +1,15 @@
-//! The carriers of a mapping that lists several, and the names that are forwarded between them.
+//! The carriers of a mapping that lists several, or one other than UDP and MQTT, and the names that
+//! are forwarded between them.
 
 use std::fmt;
 use std::net::SocketAddr;
 use std::str::FromStr;
 
 use crate::broker::Broker;
+use crate::ethernet::EthernetGroup;
 use crate::topic::{Part, SpaceId, TopicError, decimal};
 
-/// A carrier of a mapping that lists several.
+/// A carrier of a mapping that lists its carriers.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConfiguredCarrier {
     /// The network.
@@ -23,6 +25,8 @@ pub enum CarrierMedium {
     Udp(UdpGroup),
     /// An MQTT broker.
     Mqtt(Box<Broker>),
+    /// Ethernet frames.
+    Ethernet(EthernetGroup),
 }
 
 /// A UDP group or host, and how datagrams reach it.

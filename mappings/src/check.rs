@@ -8,6 +8,7 @@ mod carriers;
 mod cell;
 mod confirm;
 mod environment;
+mod ethernet;
 mod finding;
 mod loss;
 mod meaning;

@@ -53,13 +53,13 @@ codes! {
     Domain = "M012", "A DDS domain is 0 to 232, and only a ROS 2 space has one.";
     DomainTwice = "M013", "Two spaces are in the same DDS domain, so the bridges cannot distinguish their topics. Give each space its own domain.";
     UndeclaredSpace = "M014", "A variable names a space that is not listed under `spaces`.";
-    Address = "M020", "The PubSub address is neither `opc.udp://<IPv4 or IPv6 address>:<port>` nor `mqtt://<host>:<port>` (with TLS `mqtts://`). Host names of UDP addresses are not supported. Put the user name and password of a broker into a file, `mqtt: {credentials: ..}`.";
+    Address = "M020", "The PubSub address is neither `opc.udp://<IPv4 or IPv6 address>:<port>` nor `mqtt://<host>:<port>` (with TLS `mqtts://`). Host names of UDP addresses are not supported. Put the user name and password of a broker into a file, `mqtt: {credentials: ..}`. An address under `eth` is the MAC address of a host or group, alone or as `opc.eth://<MAC address>:<VLAN>.<priority>`.";
     DiscoveryGroup = "M021", "224.0.2.14 is the group of OPC UA for discovery messages; data sent there reaches every program that searches for publishers.";
     UnscopedGroup = "M022", "The group is outside 239.0.0.0/8, the range for free use within a site. Other groups are assigned to protocols, and switches may treat them as such.";
     Interface = "M023", "An interface is given by its name in the operating system (at most 15 characters, `ip link` lists them) or by an address of it.";
     Duration = "M024", "A duration is a number with its unit, such as 500ms, 1s or 2.5s, from 10ms to 1h.";
     Timing = "M025", "A writer without new values sends a message once per keep_alive_period. With a shorter receive_timeout it would be reported as lost each time.";
-    Carriers = "M026", "A list of carriers has 1 to 4 entries with `udp` or `mqtt`, each with another address, and at most one entry with `settings` for all of them.";
+    Carriers = "M026", "A list of carriers has 1 to 4 entries with `udp`, `mqtt` or `eth`, each with another address, and at most one entry with `settings` for all of them.";
     Forward = "M027", "A name under `forward` is a space (ua_1), a namespace of it (ua_1_2) or a topic (ua_1_2_10). The publisher of a name is at one carrier, so a name and its parts are listed at one carrier only; otherwise its messages would go round in a circle.";
     Namespace = "M030", "A namespace is an index from 1 to 65535 and a URI; each occurs once.";
     UndeclaredNamespace = "M031", "The namespace index of a node is not listed under `namespaces`. An index alone is ambiguous, because servers number their namespaces differently; the URI identifies the namespace.";

@@ -18,7 +18,7 @@ use crate::server_entries::{FindSkillsEntry, FromEntry, RemoteServerEntry, ToEnt
 use crate::tree::{Kind, Node, Place};
 
 pub(crate) use alarm::{AcknowledgesEntry, AlarmEntry, ReportsEntry};
-pub(crate) use carriers::{CarrierEntry, PubSubForm, UdpEntry};
+pub(crate) use carriers::{CarrierEntry, EthernetEntry, PubSubForm, UdpEntry};
 pub(crate) use security::{
     GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
 };
@@ -81,6 +81,8 @@ document! {
         address: String,
         /// Settings of the MQTT broker in `address`.
         mqtt: MqttEntry,
+        /// Ethernet frames instead of UDP, without `address`, `mqtt`, `interface` and `ttl`.
+        eth: EthernetEntry,
         /// Name or address of the network interface. Default: the operating system chooses.
         interface: String,
         /// Hops a multicast datagram may travel. Default 1: it stays on the link.

@@ -11,6 +11,7 @@ mod difference;
 mod document;
 mod endpoint;
 mod environment;
+mod ethernet;
 mod findings;
 mod include;
 mod key_text;
@@ -47,6 +48,7 @@ pub use difference::Difference;
 pub use documents::{harmless_json, is_obeyed, nearest};
 pub use endpoint::Endpoint;
 pub use environment::{Environment, LiveNode, LiveRemote, LiveServer, LiveSpace, LiveTopic};
+pub use ethernet::{EthernetGroup, MacAddress};
 
 pub use loss::{Loss, LossAction, Motion};
 pub use mapping::{

@@ -386,7 +386,7 @@ pub struct PubSub {
     /// wait to be sent and fit into [`max_datagram`](Self::max_datagram) and an Ethernet frame; 1
     /// sends each alone.
     pub messages_per_datagram: u8,
-    /// The carriers of a mapping that lists several; empty for a mapping with one.
+    /// The carriers of a mapping that lists several or uses Ethernet; otherwise empty.
     /// [`address`](Self::address) and [`broker`](Self::broker) are then the first of each kind.
     pub carriers: Vec<ConfiguredCarrier>,
 }

@@ -5,8 +5,8 @@ use std::num::NonZeroU16;
 use std::time::Duration;
 
 use mappings::{
-    CarrierMedium, Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy,
-    ServiceRole, SpaceId, TopicId, Trigger, UaField,
+    CarrierMedium, Checked, Code, EthernetGroup, Mapping, Overflow, PubSub, PublisherIdRule,
+    SecurityPolicy, ServiceRole, SpaceId, TopicId, Trigger, UaField,
 };
 use messages::{Conversion, Leaf, Literal, Part, Rank, Selected, Selection};
 use proptest::prelude::*;
@@ -114,6 +114,37 @@ fn everything_of_the_network_can_be_said() {
         v6.pubsub().address,
         "[ff05::40]:4840".parse::<SocketAddr>().unwrap()
     );
+}
+
+#[test]
+fn ethernet_is_the_only_carrier_or_one_of_several() {
+    let group = |text: &str, at: usize| {
+        let mapping = sound(text);
+        match &mapping.pubsub().carriers[at].medium {
+            CarrierMedium::Ethernet(group) => group.clone(),
+            other => panic!("{other:?}"),
+        }
+    };
+    let alone = group("pubsub: {eth: {interface: eth0}}", 0);
+    assert_eq!(
+        (alone.interface.as_str(), alone.address),
+        ("eth0", EthernetGroup::ADDRESS)
+    );
+    assert_eq!((alone.vlan, alone.priority), (None, None));
+    let keys = "address: 01-00-5E-7F-00-01, vlan: 5, priority: 6";
+    let url = "address: \"opc.eth://01-00-5E-7F-00-01:5.6\"";
+    let [keys, url] = [keys, url].map(|address| {
+        let text = format!("pubsub: [{{udp: {{}}}}, {{eth: {{interface: eth1, {address}}}}}]");
+        group(&text, 1)
+    });
+    assert_eq!(keys, url);
+    assert_eq!(keys.address.to_string(), "01-00-5E-7F-00-01");
+    assert_eq!((keys.vlan, keys.priority), (Some(5), Some(6)));
+    let one = group(
+        "pubsub: [{eth: {interface: eth0}}, {settings: {key_frame_period: 2s}}]",
+        0,
+    );
+    assert_eq!(one, alone);
 }
 
 #[test]

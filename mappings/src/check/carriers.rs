@@ -2,8 +2,8 @@
 
 use std::net::SocketAddr;
 
-use super::broker;
 use super::network::{address, interface, settings, ttl};
+use super::{broker, ethernet};
 use crate::broker::{Broker, BrokerAddress};
 use crate::carriers::{CarrierMedium, ConfiguredCarrier, ForwardedName, UdpGroup};
 use crate::code::Code;
@@ -42,7 +42,8 @@ pub(super) fn check(entries: &[At<CarrierEntry>], place: Place, findings: &mut F
         let note = findings.error(Code::Carriers, place, message);
         note.label(format!("at most {most}"));
     }
-    let is_settings = |entry: &CarrierEntry| entry.udp.is_none() && entry.mqtt.is_none();
+    let is_settings =
+        |entry: &CarrierEntry| entry.udp.is_none() && entry.mqtt.is_none() && entry.eth.is_none();
     let mut all = entries.iter();
     if all.all(|at| at.value.as_ref().is_some_and(is_settings)) {
         let note = findings.error(Code::Carriers, place, "the list has no carrier");
@@ -64,11 +65,11 @@ pub(super) fn check(entries: &[At<CarrierEntry>], place: Place, findings: &mut F
     pubsub
 }
 
-/// Sets the first carrier of each kind, and the list if there are several carriers.
+/// Sets the first carrier of UDP and MQTT, and the list if there are several carriers or others.
 fn adopt(pubsub: &mut PubSub, carriers: Vec<ConfiguredCarrier>) {
     let udp = carriers.iter().find_map(|carrier| match &carrier.medium {
         CarrierMedium::Udp(group) => Some(group.clone()),
-        CarrierMedium::Mqtt(_) => None,
+        CarrierMedium::Mqtt(_) | CarrierMedium::Ethernet(_) => None,
     });
     if let Some(UdpGroup {
         address,
@@ -84,9 +85,11 @@ fn adopt(pubsub: &mut PubSub, carriers: Vec<ConfiguredCarrier>) {
     }
     pubsub.broker = carriers.iter().find_map(|carrier| match &carrier.medium {
         CarrierMedium::Mqtt(broker) => Some(broker.clone()),
-        CarrierMedium::Udp(_) => None,
+        CarrierMedium::Udp(_) | CarrierMedium::Ethernet(_) => None,
     });
-    if carriers.len() > 1 {
+    let is_ethernet =
+        |carrier: &ConfiguredCarrier| matches!(carrier.medium, CarrierMedium::Ethernet(_));
+    if carriers.len() > 1 || carriers.iter().any(is_ethernet) {
         pubsub.carriers = carriers;
     }
 }
@@ -112,6 +115,7 @@ fn common(entries: &[At<CarrierEntry>], findings: &mut Findings) -> PubSub {
     let PubSubEntry {
         address,
         mqtt,
+        eth,
         interface,
         ttl,
         ..
@@ -119,6 +123,7 @@ fn common(entries: &[At<CarrierEntry>], findings: &mut Findings) -> PubSub {
     let places = [
         ("address", address.as_ref().map(|at| at.place)),
         ("mqtt", mqtt.as_ref().map(|at| at.place)),
+        ("eth", eth.as_ref().map(|at| at.place)),
         ("interface", interface.as_ref().map(|at| at.place)),
         ("ttl", ttl.as_ref().map(|at| at.place)),
     ];
@@ -134,13 +139,19 @@ fn common(entries: &[At<CarrierEntry>], findings: &mut Findings) -> PubSub {
 
 /// Returns the network of an entry; `None` for an entry with settings, and for a faulty entry.
 fn medium(entry: &CarrierEntry, place: Place, findings: &mut Findings) -> Option<CarrierMedium> {
-    match (&entry.udp, &entry.mqtt, &entry.settings) {
-        (Some(udp), None, None) => udp_group(udp.value.as_ref()?, findings).map(CarrierMedium::Udp),
-        (None, Some(mqtt), None) => {
+    match (&entry.udp, &entry.mqtt, &entry.eth, &entry.settings) {
+        (Some(udp), None, None, None) => {
+            udp_group(udp.value.as_ref()?, findings).map(CarrierMedium::Udp)
+        }
+        (None, Some(mqtt), None, None) => {
             let broker = listed_broker(mqtt.value.as_ref()?, mqtt.place, findings)?;
             Some(CarrierMedium::Mqtt(broker))
         }
-        (None, None, Some(_)) => {
+        (None, None, Some(eth), None) => {
+            let group = ethernet::group(eth.value.as_ref()?, eth.place, findings)?;
+            Some(CarrierMedium::Ethernet(group))
+        }
+        (None, None, None, Some(_)) => {
             if let Some(at) = &entry.forward {
                 let message = "`forward` belongs to a carrier";
                 findings
@@ -150,7 +161,7 @@ fn medium(entry: &CarrierEntry, place: Place, findings: &mut Findings) -> Option
             None
         }
         _ => {
-            let message = "an entry has one of `udp`, `mqtt` and `settings`";
+            let message = "an entry has one of `udp`, `mqtt`, `eth` and `settings`";
             findings.error(Code::Carriers, place, message).help(EXAMPLE);
             None
         }
@@ -233,8 +244,13 @@ fn is_same_network(one: &CarrierMedium, other: &CarrierMedium) -> bool {
         (CarrierMedium::Mqtt(one), CarrierMedium::Mqtt(other)) => {
             one.address == other.address && one.prefix == other.prefix
         }
-        (CarrierMedium::Udp(_), CarrierMedium::Mqtt(_))
-        | (CarrierMedium::Mqtt(_), CarrierMedium::Udp(_)) => false,
+        (CarrierMedium::Ethernet(one), CarrierMedium::Ethernet(other)) => {
+            (&one.interface, one.address, one.vlan) == (&other.interface, other.address, other.vlan)
+        }
+        (
+            CarrierMedium::Udp(_) | CarrierMedium::Mqtt(_) | CarrierMedium::Ethernet(_),
+            _different,
+        ) => false,
     }
 }
 

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::cell::is_uri;
-use super::{broker, carriers, permissions};
+use super::{broker, carriers, ethernet, permissions};
 use crate::broker::BrokerAddress;
 use crate::code::Code;
 use crate::document::{
@@ -27,7 +27,11 @@ pub(super) fn pubsub(entry: Option<&At<PubSubForm>>, findings: &mut Findings) ->
     };
     match value {
         None => PubSub::default(),
-        Some(PubSubForm::One(entry)) => settings(entry, findings),
+        Some(PubSubForm::One(entry)) => {
+            let mut pubsub = settings(entry, findings);
+            pubsub.carriers.extend(ethernet::alone(entry, findings));
+            pubsub
+        }
         Some(PubSubForm::Several(entries)) => carriers::check(entries, *place, findings),
     }
 }

@@ -13,12 +13,31 @@ document! {
         udp: UdpEntry,
         /// An MQTT broker; its `address` is required.
         mqtt: MqttEntry,
+        /// Ethernet frames with the EtherType of UADP, B62C; their `interface` is required.
+        eth: EthernetEntry,
         /// Names of publishers at this carrier, whose messages are forwarded to the other carriers:
         /// a space (ua_1), a namespace of it (ua_1_2) or a topic (ua_1_2_10), at most 1000. Requests
         /// of calls and confirmations of commands cross in the other direction. Default: none.
         forward: Vec<At<String>>,
         /// Settings of all carriers, in an entry without a carrier.
         settings: PubSubEntry,
+    }
+
+    /// UADP over Ethernet. The program needs the capability CAP_NET_RAW.
+    struct EthernetEntry {
+        /// Name of the network interface, such as eth0.
+        #[schemars(required)]
+        interface: String,
+        /// MAC address of a group, 01-00-5E-00-00-00 to 01-00-5E-7F-FF-FF, or of another host.
+        /// Default 01-00-5E-40-00-28. Also as opc.eth://01-00-5E-40-00-28:5.6, with the VLAN and
+        /// the priority.
+        address: String,
+        /// VLAN of the frames, 1 to 4094. Default: no VLAN.
+        #[schemars(range(min = 1, max = 4094))]
+        vlan: u16,
+        /// Priority of sent frames (PCP), 0 to 7. Default 0.
+        #[schemars(range(max = 7))]
+        priority: u16,
     }
 
     /// UDP multicast or unicast.

@@ -26,8 +26,6 @@ pub struct Relay {
     /// Whether the broker decides who may send a request. Otherwise only secured groups and calls
     /// that are open to all may be requested.
     pub authorized: bool,
-    /// The largest message in bytes that the broker takes, if it is known.
-    pub limit: Option<u16>,
 }
 
 /// Whether a received message belongs to a route between carriers.

@@ -458,7 +458,6 @@ fn a_command_that_a_broker_delivers_late_is_dropped_and_counted() {
         let relay = Relay {
             within: Duration::from_secs(1),
             authorized: false,
-            limit: None,
         };
         for program in &mut cell.programs {
             program.router.set_relay(Some(relay));

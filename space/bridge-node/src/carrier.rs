@@ -9,12 +9,13 @@ use std::sync::Arc;
 use bridge_core::{Link, Relay};
 use broker::{Identity, Mqtt};
 use mappings::{
-    Broker, BrokerAddress, CarrierMedium, ConfiguredCarrier, Mapping, PubSub, SpaceId, UdpGroup,
+    Broker, BrokerAddress, CarrierMedium, ConfiguredCarrier, EthernetGroup, Mapping, PubSub,
+    SpaceId, UdpGroup,
 };
 use tokio::sync::watch;
 use transport::{
-    Capacity, Carrier, CarrierRules, Carriers, Judgement, MessagePath, Options, ProcessHub,
-    Senders, Udp,
+    Capacity, Carrier, CarrierRules, Carriers, Ethernet, EthernetError, EthernetOptions, Judgement,
+    MessagePath, Options, ProcessHub, Senders, Udp, VlanTag,
 };
 
 use crate::arguments::Arguments;
@@ -69,6 +70,7 @@ fn open_all(
     for ConfiguredCarrier { medium, .. } in listed {
         let carrier = match medium {
             CarrierMedium::Mqtt(broker) => open_broker(broker, identity)?,
+            CarrierMedium::Ethernet(group) => open_ethernet(group, arguments, hub)?,
             CarrierMedium::Udp(group) => {
                 let options = udp_options(arguments, group, several)?;
                 let udp = open_udp(&options, hub)?;
@@ -93,6 +95,36 @@ fn open_udp(options: &Options, hub: Option<&ProcessHub>) -> Result<Box<dyn Carri
     Ok(match hub {
         Some(hub) => hub.connect(udp, options),
         None => Box::new(udp),
+    })
+}
+
+/// Opens a carrier of Ethernet. The interface of the command line takes precedence.
+fn open_ethernet(
+    group: &EthernetGroup,
+    arguments: &Arguments,
+    hub: Option<&ProcessHub>,
+) -> Result<Box<dyn Carrier>, Failure> {
+    let flag = arguments.flags.interface.clone();
+    let interface = flag.unwrap_or_else(|| group.interface.clone());
+    let tag = match (group.vlan, group.priority) {
+        (None, None) => None,
+        (vlan, priority) => VlanTag::new(vlan.unwrap_or_default(), priority.unwrap_or_default()),
+    };
+    let options = EthernetOptions {
+        tag,
+        ..EthernetOptions::new(interface, group.address.octets())
+    };
+    let ethernet = Ethernet::open(&options).map_err(|error| {
+        let is_denied = matches!(error, EthernetError::NotPermitted(_));
+        let kind = match is_denied {
+            true => FailureKind::Configuration,
+            false => FailureKind::Unavailable,
+        };
+        Failure::new(kind, error.to_string())
+    })?;
+    Ok(match hub {
+        Some(hub) => hub.connect_ethernet(ethernet),
+        None => Box::new(ethernet),
     })
 }
 
@@ -193,10 +225,13 @@ pub(crate) fn relay(carrier: &dyn Carrier) -> Option<Relay> {
     Some(Relay {
         within: carrier.within()?,
         authorized: carrier.senders() == Senders::Authorized,
-        limit: carrier
-            .limit()
-            .map(|limit| u16::try_from(limit).unwrap_or(u16::MAX)),
     })
+}
+
+/// Returns the largest message in bytes that the network takes, if it is known.
+pub(crate) fn limit(carrier: &dyn Carrier) -> Option<u16> {
+    let limit = carrier.limit()?;
+    Some(u16::try_from(limit).unwrap_or(u16::MAX))
 }
 
 /// Returns the capacity of the network of the carrier.

@@ -418,6 +418,7 @@ fn router_of<P: Program>(
     let mut router = Router::new(settings, Arc::clone(mapping));
     router.set_owned(P::owned(mapping), now());
     router.set_relay(carrier::relay(carrier));
+    router.set_limit(carrier::limit(carrier));
     router.set_link(carrier::link(carrier));
     identify(&mut router, program.rank())?;
     if P::SHOWS_VALUES_AT_STANDBY {

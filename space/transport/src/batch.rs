@@ -1,4 +1,4 @@
-//! System calls that receive or send several datagrams.
+//! System calls that receive or send several datagrams or frames.
 
 use std::cell::RefCell;
 use std::fmt;
@@ -155,6 +155,31 @@ pub(crate) fn send(
     let headers = slices.iter().zip(&mut controls);
     let mut headers: Vec<MMsgHdr<'_>> = headers
         .map(|(slice, control)| MMsgHdr::new_with_addr(&target, slice, control))
+        .collect();
+    Ok(sendmmsg(socket, &mut headers, SendFlags::DONTWAIT)?)
+}
+
+/// Sends up to [`AT_ONCE`] messages through a bound socket, each behind the bytes of a header.
+/// Returns the number of sent messages, as [`send`].
+///
+/// # Errors
+/// The error of the system for the first message.
+pub(crate) fn send_behind(
+    socket: impl AsFd,
+    header: &[u8],
+    messages: &[Outgoing<'_>],
+) -> io::Result<usize> {
+    let bytes = messages.iter().take(AT_ONCE).map(|message| message.bytes);
+    let slices: Vec<[IoSlice<'_>; 2]> = bytes
+        .map(|bytes| [IoSlice::new(header), IoSlice::new(bytes)])
+        .collect();
+    let mut controls: Vec<SendAncillaryBuffer<'_, '_, '_>> = slices
+        .iter()
+        .map(|_| SendAncillaryBuffer::default())
+        .collect();
+    let headers = slices.iter().zip(&mut controls);
+    let mut headers: Vec<MMsgHdr<'_>> = headers
+        .map(|(slices, control)| MMsgHdr::new(slices, control))
         .collect();
     Ok(sendmmsg(socket, &mut headers, SendFlags::DONTWAIT)?)
 }

@@ -15,6 +15,7 @@ use std::task::{Context, Poll, Waker};
 use std::time::Duration;
 
 use crate::carrier::{Capacity, Carrier, CarrierChange, Outgoing, Received, Senders};
+use crate::ethernet::{Ethernet, EthernetOptions};
 use crate::udp::{Options, SendError, Udp};
 
 /// The carriers of one process that exchange messages without the network.
@@ -38,9 +39,12 @@ struct HubMember {
 
 /// Members with the same group receive each other's messages.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct HubGroup {
-    address: SocketAddr,
-    interface: Option<String>,
+enum HubGroup {
+    Udp {
+        address: SocketAddr,
+        interface: Option<String>,
+    },
+    Ethernet(EthernetOptions),
 }
 
 /// A network below an [`InProcess`] carrier: it drops the datagrams of the programs of the process
@@ -77,6 +81,23 @@ impl HubNetwork for Udp {
     }
 }
 
+/// Frames of this host are not received from the network, so there are none to drop.
+impl HubNetwork for Ethernet {
+    fn drop_companions(&mut self, _: Vec<SocketAddr>) {}
+
+    fn is_companion(&self, _: SocketAddr) -> bool {
+        false
+    }
+
+    fn sender(&self) -> SocketAddr {
+        Self::seen_source(self)
+    }
+
+    fn seen_source(&self) -> SocketAddr {
+        Self::seen_source(self)
+    }
+}
+
 impl ProcessHub {
     /// Connects a socket with the other sockets of the hub that use the same group and interface.
     /// A unicast socket stays as it is, because no other program of the process receives at it.
@@ -85,11 +106,18 @@ impl ProcessHub {
         if !options.address.ip().is_multicast() || !options.peers.is_empty() || options.own {
             return Box::new(udp);
         }
-        let group = HubGroup {
+        let group = HubGroup::Udp {
             address: options.address,
             interface: options.interface.clone(),
         };
         Box::new(InProcess::new(self, udp, group))
+    }
+
+    /// Connects an Ethernet socket with the other sockets of the hub that have the same options.
+    #[must_use]
+    pub fn connect_ethernet(&self, ethernet: Ethernet) -> Box<dyn Carrier> {
+        let group = HubGroup::Ethernet(ethernet.options().clone());
+        Box::new(InProcess::new(self, ethernet, group))
     }
 
     fn members(&self) -> MutexGuard<'_, Vec<HubMember>> {

@@ -71,11 +71,7 @@ impl Interface {
 
     /// Returns the speed in bytes per second, or `None` if the system does not know it.
     pub(crate) fn speed(&self) -> Option<u64> {
-        let path = std::path::Path::new("/sys/class/net")
-            .join(&self.name)
-            .join("speed");
-        // Mbit/s. An interface without a link has -1, and a wireless interface cannot be read.
-        speed_of(&std::fs::read_to_string(path).ok()?)
+        speed(&self.name)
     }
 
     /// Returns true if kernel state of `other` is still valid. A recreated interface has another
@@ -83,6 +79,15 @@ impl Interface {
     pub(crate) fn is_same(&self, other: &Self) -> bool {
         (&self.name, self.index, self.address) == (&other.name, other.index, other.address)
     }
+}
+
+/// Returns the speed of an interface in bytes per second, or `None` if the system does not know it.
+pub(crate) fn speed(interface: &str) -> Option<u64> {
+    let path = std::path::Path::new("/sys/class/net")
+        .join(interface)
+        .join("speed");
+    // Mbit/s. An interface without a link has -1, and a wireless interface cannot be read.
+    speed_of(&std::fs::read_to_string(path).ok()?)
 }
 
 /// Returns the bytes per second of a speed in Mbit/s.

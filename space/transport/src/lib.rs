@@ -1,13 +1,15 @@
-//! Carriers of NetworkMessages, and datagrams over UDP multicast and unicast.
+//! Carriers of NetworkMessages: datagrams over UDP multicast and unicast, and Ethernet frames.
 //!
 //! This crate sends and receives bytes and does not interpret them. A [`Carrier`] is a PubSub
 //! network. A [`Udp`] is a multicast
 //! group (or a unicast address) on a network interface. As in OPC 10000-14, 7.3.2 (UADP over UDP),
-//! the address is used for receiving and sending.
+//! the address is used for receiving and sending. An [`Ethernet`] carries UADP without IP
+//! (OPC 10000-14, 7.3.3).
 
 mod batch;
 mod carrier;
 mod carriers;
+mod ethernet;
 mod filter;
 mod in_process;
 mod interface;
@@ -19,6 +21,7 @@ pub use carrier::{
     Traffic,
 };
 pub use carriers::{CarrierRules, Carriers, ForwardTo, Judgement, MessagePath};
+pub use ethernet::{Ethernet, EthernetError, EthernetOptions, VlanTag};
 pub use in_process::ProcessHub;
 pub use interface::{Interface, InterfaceError, interfaces};
 pub use udp::{OpenError, Options, SendError, Udp};

@@ -117,8 +117,8 @@ pub enum SendError {
     /// The kernel's send buffer is full.
     #[error("the send buffer is full")]
     Busy,
-    /// The datagram exceeds the maximum size of a UDP datagram.
-    #[error("larger than a UDP datagram")]
+    /// The message exceeds the maximum size of a UDP datagram or Ethernet frame.
+    #[error("larger than a UDP datagram or Ethernet frame")]
     TooBig,
     /// There is no route, the interface is down, or a unicast peer refused the datagram.
     #[error("the network is unreachable")]
@@ -446,14 +446,14 @@ fn anew(
     Ok((receiver, sender(options, interface)?))
 }
 
-fn send_error(error: &io::Error) -> SendError {
+pub(crate) fn send_error(error: &io::Error) -> SendError {
     let unreachable = [
         io::ErrorKind::NetworkUnreachable,
         io::ErrorKind::HostUnreachable,
         io::ErrorKind::NetworkDown,
         io::ErrorKind::ConnectionRefused,
     ];
-    if error.kind() == io::ErrorKind::WouldBlock {
+    if error.kind() == io::ErrorKind::WouldBlock || error.raw_os_error() == Some(ENOBUFS) {
         SendError::Busy
     } else if unreachable.contains(&error.kind()) {
         SendError::Unreachable
@@ -466,6 +466,8 @@ fn send_error(error: &io::Error) -> SendError {
 
 /// The error number of Linux for "message too long", for which std has no `ErrorKind`.
 const EMSGSIZE: i32 = 90;
+/// The error number of Linux for a full queue of the network interface.
+const ENOBUFS: i32 = 105;
 
 fn receiver(
     options: &Options,
@@ -603,7 +605,7 @@ fn sender(options: &Options, interface: Option<&Interface>) -> Result<Sender, Op
 }
 
 /// Size of the send buffer in bytes.
-const SEND_BUFFER: usize = 1 << 20;
+pub(crate) const SEND_BUFFER: usize = 1 << 20;
 
 #[cfg(test)]
 mod tests;

@@ -23,6 +23,12 @@ impl Router {
         self.values.arrival = relay;
     }
 
+    /// Sets the largest message in bytes that the network takes; `None` if only the mapping limits
+    /// it.
+    pub const fn set_limit(&mut self, limit: Option<u16>) {
+        self.values.limit = limit;
+    }
+
     /// Sets the properties of the network by which the next message is received, if the program
     /// has several networks. [`set_relay`](Self::set_relay) sets the same for all.
     pub const fn set_arrival(&mut self, relay: Option<Relay>, forwarding: Forwarding) {

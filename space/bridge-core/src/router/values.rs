@@ -57,6 +57,8 @@ pub(super) struct Values {
     pub(super) part: Option<Box<OwnPart>>,
     /// The broker between the programs; `None` for a network that does not store messages.
     pub(super) relay: Option<Relay>,
+    /// The largest message in bytes that the network takes, if it is known.
+    pub(super) limit: Option<u16>,
     /// The broker by which the current message was received.
     pub(super) arrival: Option<Relay>,
     /// The route of the current message.
@@ -107,6 +109,7 @@ impl Values {
             redundant: None,
             part: None,
             relay: None,
+            limit: None,
             arrival: None,
             forwarding: Forwarding::None,
             confirmers: BTreeMap::new(),
@@ -260,8 +263,9 @@ impl Values {
     pub(super) fn sizes(&self) -> (u16, u32) {
         let pubsub = self.mapping.pubsub();
         let room = u16::try_from(self.overhead).unwrap_or_default();
-        let limit = self.relay.and_then(|relay| relay.limit);
-        let most = limit.map_or(pubsub.max_datagram, |limit| limit.min(pubsub.max_datagram));
+        let most = self
+            .limit
+            .map_or(pubsub.max_datagram, |limit| limit.min(pubsub.max_datagram));
         let max_datagram = most.saturating_sub(room);
         (max_datagram, pubsub.max_message)
     }

@@ -5,7 +5,7 @@ use tracing::{info, warn};
 use transport::{Arrival, Carrier, CarrierChange, Senders};
 
 use super::Shell;
-use crate::carrier::{link, relay};
+use crate::carrier::{limit, link, relay};
 use crate::clock::now;
 use crate::port::Port;
 
@@ -30,8 +30,9 @@ impl<P: Port> Shell<P> {
             let why = "messages of another program of this process were not received in time";
             self.router.dropped(Reason::Overflow, late, why);
         }
-        // A broker may have another limit after each connection.
+        // A broker may have another limit after each connection, and an interface another MTU.
         self.router.set_relay(relay(self.carrier.as_ref()));
+        self.router.set_limit(limit(self.carrier.as_ref()));
         self.router.set_link(link(self.carrier.as_ref()));
     }
 
@@ -63,7 +64,6 @@ pub(super) fn arrival(carrier: &dyn Carrier) -> (Option<Relay>, Forwarding) {
     let relay = within.map(|within| Relay {
         within,
         authorized: senders == Senders::Authorized,
-        limit: None,
     });
     let forwarding = match not_forwarded {
         Some(reason) => Forwarding::Refused(reason),

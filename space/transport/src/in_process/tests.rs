@@ -106,7 +106,7 @@ impl HubNetwork for Memory {
 }
 
 fn group(port: u16) -> HubGroup {
-    HubGroup {
+    HubGroup::Udp {
         address: SocketAddr::from(([239, 0, 0, 1], port)),
         interface: None,
     }

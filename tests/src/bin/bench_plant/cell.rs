@@ -49,7 +49,6 @@ impl PlantCell {
         router.set_relay(Some(Relay {
             within: broker.within,
             authorized: false,
-            limit: None,
         }));
         let twist = Registry::bundle(Dialect::Ros1)
             .get(&"geometry_msgs/Twist".parse().unwrap())
