@@ -67,7 +67,7 @@ impl Played {
     fn operate(&mut self, input: &mut Input<'_>) {
         let (what, which) = (input.byte(), input.byte());
         let now = self.now;
-        match what % 9 {
+        match what % 10 {
             0 => {
                 let how = input.byte();
                 let channel = Channel {
@@ -98,8 +98,20 @@ impl Played {
             7 => self
                 .registry
                 .stood_still(Duration::from_millis(which.into())),
+            8 => self.listed(which, input),
             _ => self.pass(Duration::from_millis(u64::from(which) * 40), input),
         }
+    }
+
+    /// Replaces the servers that a Global Discovery Server lists.
+    fn listed(&mut self, which: u8, input: &mut Input<'_>) {
+        let servers = (0..which % 4).map(|_| Announcement {
+            instance: name(input.byte()),
+            url: url(input.byte()),
+            capabilities: Vec::new(),
+        });
+        let servers = servers.collect();
+        self.registry.listed(servers, self.now);
     }
 
     /// Renames an announcement; mDNS uses another name only if it is free.

@@ -17,6 +17,10 @@ pub enum Loss {
     Hanging,
     /// The server was never verified, and was displaced by another server.
     Displaced,
+    /// The Global Discovery Server no longer lists the server, or has not answered for too long.
+    Unlisted,
+    /// Another source reports the server that a Global Discovery Server lists.
+    Superseded,
 }
 
 impl Loss {
@@ -31,6 +35,8 @@ impl Loss {
             Self::Unreachable => "unreachable",
             Self::Hanging => "hanging",
             Self::Displaced => "displaced",
+            Self::Unlisted => "unlisted",
+            Self::Superseded => "superseded",
         }
     }
 }

@@ -21,6 +21,31 @@ pub struct NetworkRecord {
     pub record_id: u32,
     /// The announcement.
     pub announcement: Announcement,
+    /// The source of the announcement.
+    pub source: RecordSource,
+}
+
+/// Source of a record.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RecordSource {
+    /// The server registered here, and this program announces it.
+    Registration,
+    /// mDNS.
+    Multicast,
+    /// A Global Discovery Server lists the server, and the server answers.
+    Gds,
+}
+
+impl RecordSource {
+    /// Returns the label for logs and the status.
+    #[must_use]
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Registration => "registration",
+            Self::Multicast => "multicast",
+            Self::Gds => "gds",
+        }
+    }
 }
 
 /// Records by instance name in lower case: names of DNS that differ only in case are equal.
@@ -49,6 +74,7 @@ impl Network {
     pub(crate) fn put(
         &mut self,
         announcement: Announcement,
+        source: RecordSource,
         now: Instant,
     ) -> Option<NetworkRecord> {
         let key = announcement.instance.to_ascii_lowercase();
@@ -65,13 +91,16 @@ impl Network {
             self.arrivals.insert(key.clone(), arrival);
         }
         let known = self.records.get(&key);
-        if let Some(known) = known.filter(|known| known.announcement == announcement) {
+        let is_same =
+            |known: &&NetworkRecord| known.announcement == announcement && known.source == source;
+        if let Some(known) = known.filter(is_same) {
             return Some(known.clone());
         }
         self.last_id = self.last_id.saturating_add(1);
         let record = NetworkRecord {
             record_id: self.last_id,
             announcement,
+            source,
         };
         self.records.insert(key, record)
     }

@@ -1,6 +1,7 @@
 //! The registry itself: registrations and announcements are inputs, the available servers are
 //! outputs.
 
+mod announcements;
 mod room;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -8,8 +9,7 @@ use std::time::{Duration, Instant};
 
 use crate::asked::{Asked, Channel, RegisterFault};
 use crate::loss::Loss;
-use crate::name::{label, renamed};
-use crate::network::{Announcement, Network, NetworkRecord, place};
+use crate::network::{Announcement, Network, NetworkRecord, RecordSource, place};
 use crate::watch::{EndpointWatch, Outcome, Patience, Probe, Sign};
 
 /// Limits and time limits of a registry.
@@ -115,6 +115,9 @@ pub struct Registry {
     /// registration expires.
     away: BTreeMap<String, Server>,
     network: Network,
+    /// The servers that a Global Discovery Server lists, by host and port. Those that answer have a
+    /// record, unless another source reports them.
+    listed: BTreeMap<String, Announcement>,
     watch: EndpointWatch,
     events: VecDeque<Event>,
     refused: u64,
@@ -149,6 +152,7 @@ impl Registry {
             servers: BTreeMap::new(),
             away: BTreeMap::new(),
             network: Network::default(),
+            listed: BTreeMap::new(),
             watch: EndpointWatch::default(),
             events: VecDeque::new(),
             refused: 0,
@@ -256,42 +260,16 @@ impl Registry {
         }
         self.events.push_back(Event::Registered {
             server_uri,
-            discovery_urls,
+            discovery_urls: discovery_urls.clone(),
         });
+        for url in &discovery_urls {
+            self.supersede_at(&place(url));
+        }
         if let Some(wished) = wished {
-            self.network.put(wished.clone(), now);
+            self.supersede(&wished.instance);
+            self.network
+                .put(wished.clone(), RecordSource::Registration, now);
             self.events.push_back(Event::Announce(wished));
-        }
-    }
-
-    /// Handles an announcement by mDNS, new or repeated.
-    pub fn announced(&mut self, announcement: Announcement, now: Instant) {
-        let instance = &announcement.instance;
-        if self.is_ours(instance) {
-            // An announcement of this program itself.
-            return;
-        }
-        let known = self.network.get(instance);
-        if known.is_some_and(|known| known.announcement == announcement) {
-            return;
-        }
-        if known.is_none() && !self.make_room_on_network(&announcement, now) {
-            return;
-        }
-        let instance = announcement.instance.clone();
-        let url = announcement.url.clone();
-        if let Some(before) = self.network.put(announcement, now) {
-            self.unwatch(&before.announcement.url);
-        }
-        self.watch.add(&url, self.settings.probe_every, now);
-        let record = self.network.get(&instance).cloned();
-        self.events.extend(record.map(Event::Seen));
-    }
-
-    /// Handles a goodbye by mDNS, or the expiry of an announcement.
-    pub fn withdrawn(&mut self, instance: &str) {
-        if !self.is_ours(instance) {
-            self.vanish(instance, Loss::Goodbye);
         }
     }
 
@@ -299,21 +277,6 @@ impl Registry {
     pub fn semaphore_gone(&mut self, server_uri: &str) {
         self.forget_away(server_uri);
         self.end(server_uri, Loss::SemaphoreGone);
-    }
-
-    /// Renames an announcement of this program: another host has the name (RFC 6762, 9).
-    pub fn renamed(&mut self, from: &str, to: &str, now: Instant) {
-        let mut announced = self
-            .servers
-            .values_mut()
-            .filter_map(|server| server.announced.as_mut());
-        let Some(ours) = announced.find(|ours| ours.instance.eq_ignore_ascii_case(from)) else {
-            return;
-        };
-        to.clone_into(&mut ours.instance);
-        let ours = ours.clone();
-        self.network.remove(from);
-        self.network.put(ours, now);
     }
 
     /// Returns whether an endpoint is supervised.
@@ -423,6 +386,9 @@ impl Registry {
             Sign::Restarted => self.restarted(url),
             Sign::Lost(loss) => self.lose(url, loss, outcome == Outcome::Refused, now),
         }
+        if matches!(outcome, Outcome::Alive { .. }) {
+            self.show_listed(&place(url), now);
+        }
     }
 
     /// Removes expired registrations.
@@ -530,7 +496,8 @@ impl Registry {
             };
             if let Some(announced) = server.announced.as_mut().filter(|old| is_there(&old.url)) {
                 announced.url.clone_from(other);
-                self.network.put(announced.clone(), now);
+                self.network
+                    .put(announced.clone(), RecordSource::Registration, now);
                 self.events.push_back(Event::Announce(announced.clone()));
             }
         }
@@ -544,6 +511,10 @@ impl Registry {
             away.asked.discovery_urls.iter().find(|url| is_there(url))
         }) {
             self.watch.add(url, self.settings.probe_every, now);
+        }
+        // A listed server is shown again when it answers.
+        if let Some(listed) = self.listed.get(&place_of_url) {
+            self.watch.add(&listed.url, self.settings.probe_every, now);
         }
     }
 
@@ -635,45 +606,10 @@ impl Registry {
             .flat_map(|server| &server.asked.discovery_urls)
             .chain(self.network.iter().map(|record| &record.announcement.url));
         let place_of_url = place(url);
-        if !urls.any(|known| place(known) == place_of_url) {
+        let is_listed = self.listed.contains_key(&place_of_url);
+        if !is_listed && !urls.any(|known| place(known) == place_of_url) {
             self.watch.remove(url);
         }
-    }
-
-    /// Returns whether this program announces that name for a registered server.
-    fn is_ours(&self, instance: &str) -> bool {
-        let mut announced = self
-            .servers
-            .values()
-            .filter_map(|server| server.announced.as_ref());
-        announced.any(|ours| ours.instance.eq_ignore_ascii_case(instance))
-    }
-
-    /// Returns the announcement for a server: the requested name, with a number if another server
-    /// has that name (RFC 6762, 9). Returns `None` if the server already announces itself with this
-    /// name and URL.
-    fn free(&self, asked: &Asked) -> Option<Announcement> {
-        let mut wish = asked.announcement()?;
-        let others = |name: &str| {
-            self.servers
-                .values()
-                .filter(|server| server.asked.server_uri != asked.server_uri)
-                .filter_map(|server| server.announced.as_ref())
-                .any(|announced| announced.instance.eq_ignore_ascii_case(name))
-        };
-        // Each turn skips one of the existing names.
-        for _ in 0..=self.servers.len() + self.network.len() {
-            let heard = self
-                .network
-                .get(&wish.instance)
-                .filter(|_| !self.is_ours(&wish.instance));
-            match heard {
-                Some(heard) if heard.announcement.url == wish.url => return None,
-                None if !others(&wish.instance) => return Some(wish),
-                Some(_) | None => wish.instance = renamed(&wish.instance),
-            }
-        }
-        None
     }
 }
 
@@ -683,21 +619,10 @@ impl Server {
     fn expires(&self) -> bool {
         self.asked.semaphore_file_path.is_empty()
     }
-}
 
-impl Asked {
-    /// Returns the requested announcement, if any.
-    fn announcement(&self) -> Option<Announcement> {
-        let mdns = self.mdns.as_ref()?;
-        let instance = label(&mdns.name);
-        if instance.is_empty() {
-            return None;
-        }
-        Some(Announcement {
-            instance,
-            url: self.discovery_urls.first()?.clone(),
-            capabilities: mdns.capabilities.clone(),
-        })
+    /// Returns whether one of its endpoints has this host and port.
+    fn is_at(&self, at: &str) -> bool {
+        self.place == at || self.asked.discovery_urls.iter().any(|url| place(url) == at)
     }
 }
 

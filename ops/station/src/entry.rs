@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
 use discovery::lds::LdsSettings;
-use discovery::{DEFAULT_LDS, Interface};
+use discovery::{DEFAULT_LDS, Interface, ListingArguments};
 use plant_opcua::client::HostNames;
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::limits::LimitArguments;
@@ -85,6 +85,8 @@ struct UaStation {
     pki: Option<PathBuf>,
     #[command(flatten)]
     gds: GdsArguments,
+    #[command(flatten)]
+    listing: ListingArguments,
     /// Trust every certificate. For tests and demonstrations only
     #[arg(long, requires = "pki")]
     trust_any_certificate: bool,
@@ -145,6 +147,7 @@ impl Service for UaStation {
             allow_unsecured: self.allow_unsecured,
             register_every: Duration::from_secs(self.register_period.into()),
             pki: self.pki.or_else(usual),
+            listing: self.listing.query(gds.as_ref()),
             trust_any: self.trust_any_certificate,
             ..LdsSettings::at(self.endpoint)
         };

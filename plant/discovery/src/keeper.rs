@@ -6,7 +6,7 @@ use std::num::NonZeroU16;
 use std::time::{Duration, Instant};
 
 use log_limit::LogLimit;
-use registry::{Announcement, Event, Loss, Outcome, Registry, Settings};
+use registry::{Announcement, Event, Loss, Outcome, RecordSource, Registry, Settings};
 use tokio::time::sleep_until;
 use tracing::info;
 
@@ -164,7 +164,7 @@ impl Keeper {
                         loss: Loss::Unreachable | Loss::Hanging,
                     },
                     _,
-                ) => {
+                ) if record.source == RecordSource::Multicast => {
                     self.sleeps(record.announcement.clone());
                     return Some(event);
                 }

@@ -1,8 +1,7 @@
 //! The Local Discovery Server: a registry with an OPC UA endpoint, and mDNS on an interface.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::io::ErrorKind;
-use std::net::{IpAddr, SocketAddr};
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,10 +10,9 @@ use std::time::{Duration, SystemTime};
 use bridge_node::{Failure, FailureKind, Requests};
 use log_limit::LogLimit;
 use opcua::types::ApplicationType;
-use plant_opcua::enrolment::{Applicant, Enrolment, Invitation};
+use plant_opcua::enrolment::{Applicant, DirectoryClient, Enrolment, Invitation};
 use plant_opcua::own;
-use plant_opcua::patches::OtherHosts;
-use registry::{Announcement, Asked, Event, Loss, Settings, instance_name};
+use registry::{Announcement, Asked, Event, Loss, NetworkRecord, Settings, instance_name};
 use serde::Serialize;
 use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
@@ -22,11 +20,12 @@ use tokio::task::{JoinSet, spawn_blocking};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{info, warn};
 
-use crate::client;
 use crate::clock;
 use crate::connection::{RegistryRequest, RequestCounters, ServerShared};
 use crate::endpoint;
 use crate::keeper::Keeper;
+use crate::listen::{cut, listen};
+use crate::listing::{ListingStatus, ListingTask, ServerQuery};
 use crate::security::{ChannelSecurity, TOLD_EVERY};
 use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery, semaphore};
 use mdns::Interface;
@@ -54,6 +53,8 @@ pub struct LdsSettings {
     pub pki: Option<PathBuf>,
     /// The Global Discovery Server that issues the certificate. Requires `pki`.
     pub gds: Option<Invitation>,
+    /// The Global Discovery Server whose servers are listed too. Requires `pki`.
+    pub listing: Option<ServerQuery>,
     /// Whether every client certificate is trusted. For tests only.
     pub trust_any: bool,
     /// The embedding program; `None` for the program `ua-lds`.
@@ -82,6 +83,7 @@ impl LdsSettings {
             register_every: REGISTER_EVERY,
             pki: None,
             gds: None,
+            listing: None,
             trust_any: false,
             embedded: None,
         }
@@ -106,6 +108,32 @@ impl LdsSettings {
     fn uri(&self) -> String {
         let given = self.application_uri.clone();
         given.unwrap_or_else(|| format!("urn:{}:ua-lds", host_name()))
+    }
+
+    /// Returns the renewal of the certificate at the Global Discovery Server.
+    fn enrolment(&self, own: &OwnDescription) -> Option<Enrolment> {
+        let (root, gds) = (self.pki.as_ref()?, self.gds.clone()?);
+        let applicant = Applicant {
+            application_uri: own.application_uri.clone(),
+            name: own.name.clone(),
+            product_uri: "urn:ua-bridge:lds".to_owned(),
+            urls: vec![own.url.clone()],
+            capabilities: vec!["LDS".to_owned()],
+        };
+        Some(Enrolment::new(root, applicant, gds))
+    }
+
+    /// Returns the queries of the Global Discovery Server, with the identity of the discovery
+    /// server.
+    fn listing_task(&self, own: &OwnDescription) -> Option<ListingTask> {
+        let (query, root) = (self.listing.as_ref()?, self.pki.clone()?);
+        let client = DirectoryClient {
+            root,
+            application_uri: own.application_uri.clone(),
+            name: own.name.clone(),
+            gds: query.gds.clone(),
+        };
+        Some(ListingTask::new(query, client, vec![own.url.clone()]))
     }
 
     /// Opens the certificate store, and creates a missing certificate and key.
@@ -202,6 +230,9 @@ pub struct LdsStatus {
     network: Vec<RecordStatus>,
     losses: VecDeque<LossStatus>,
     counters: BTreeMap<&'static str, u64>,
+    /// The Global Discovery Server whose servers are listed too.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    gds: Option<ListingStatus>,
     #[serde(skip_serializing_if = "Option::is_none")]
     level: Option<serde_json::Value>,
     /// The certificate of the discovery server.
@@ -224,6 +255,8 @@ struct RecordStatus {
     record_id: u32,
     name: String,
     url: String,
+    /// `registration`, `multicast`, or `gds` for a server that a Global Discovery Server lists.
+    source: &'static str,
     capabilities: Vec<String>,
     since_ms: u64,
     /// The start time of its program, if known.
@@ -322,6 +355,8 @@ pub(crate) struct Lds {
     accepting: JoinSet<()>,
     /// The certificate store.
     pki: Option<PathBuf>,
+    /// The queries of the Global Discovery Server.
+    listing: Option<ListingTask>,
 }
 
 impl Lds {
@@ -372,17 +407,10 @@ impl Lds {
             Arc::new(ServerShared::new(own, security, ask).secured_only(settings.secured_only));
         let mut accepting = JoinSet::new();
         accepting.spawn(endpoint::accept(listener, Arc::clone(&shared)));
-        if let (Some(root), Some(gds)) = (&settings.pki, &settings.gds) {
-            let applicant = Applicant {
-                application_uri: shared.own.application_uri.clone(),
-                name: shared.own.name.clone(),
-                product_uri: "urn:ua-bridge:lds".to_owned(),
-                urls: vec![url.clone()],
-                capabilities: vec!["LDS".to_owned()],
-            };
-            let enrolment = Enrolment::new(root, applicant, gds.clone());
+        if let Some(enrolment) = settings.enrolment(&shared.own) {
             accepting.spawn(enrolment.keep(bridge_node::restart));
         }
+        let listing = settings.listing_task(&shared.own);
         info!(url, interface = %settings.interface, "the discovery server is listening");
         let registry = Settings {
             allow_unsecured: settings.allow_unsecured,
@@ -404,6 +432,7 @@ impl Lds {
             refused: LogLimit::every(TOLD_EVERY),
             accepting,
             pki: settings.pki.clone(),
+            listing,
         };
         lds.announce();
         Ok((lds, questions))
@@ -442,6 +471,9 @@ impl Lds {
             tokio::select! {
                 () = &mut stop => break,
                 () = self.keeper.step() => {}
+                servers = listed(&mut self.listing) => {
+                    self.keeper.registry.listed(servers, clock::now());
+                }
                 Some((question, channel, reply)) = questions.recv() => {
                     let answer = self.answer(question, &channel);
                     // The client may have disconnected.
@@ -528,7 +560,7 @@ impl Lds {
                 }
                 self.since.entry(server_uri).or_insert_with(clock::wall);
             }
-            Event::Seen(record) => self.seen(record.announcement),
+            Event::Seen(record) => self.seen(record),
             Event::Restarted { url } => {
                 info!(url, "restarted");
                 self.tell(OnLevel::Restarted { url });
@@ -542,13 +574,14 @@ impl Lds {
         }
     }
 
-    fn seen(&mut self, announcement: Announcement) {
-        let Announcement { instance, url, .. } = announcement;
+    fn seen(&mut self, record: NetworkRecord) {
+        let Announcement { instance, url, .. } = record.announcement;
         let now = clock::wall();
         let started = self.keeper.started(&url).map(clock::of_ticks);
         let after = started.and_then(|at| now.duration_since(at).ok());
         let after_ms = after.map(|after| after.as_millis());
-        info!(name = ?instance, url, after_ms, "seen on the network");
+        let source = record.source.label();
+        info!(name = ?instance, url, source, after_ms, "seen on the network");
         let source = instance.clone();
         let registered = false;
         self.tell(OnLevel::Told {
@@ -614,6 +647,7 @@ impl Lds {
             record_id: record.record_id,
             name: record.announcement.instance.clone(),
             url: record.announcement.url.clone(),
+            source: record.source.label(),
             capabilities: record.announcement.capabilities.clone(),
             since_ms: since(&record.announcement.instance),
             started_ms: self
@@ -636,6 +670,7 @@ impl Lds {
             network: network.collect(),
             losses: self.losses.clone(),
             counters: self.counters(),
+            gds: self.listing.as_ref().map(ListingTask::status),
             level: self
                 .around
                 .as_ref()
@@ -666,6 +701,10 @@ impl Lds {
             ("timed_out_total", get(timed_out)),
             ("lost_total", self.lost),
             ("level_missed_total", self.missed),
+            (
+                "gds_failures_total",
+                self.listing.as_ref().map_or(0, ListingTask::failures),
+            ),
             ("no_room_total", self.keeper.registry.refused()),
             ("displaced_total", self.keeper.registry.displaced()),
             (
@@ -692,70 +731,6 @@ impl Lds {
     }
 }
 
-/// An error of listening.
-#[derive(Debug)]
-pub(crate) enum ListenFault {
-    /// The URL is not an OPC UA URL over TCP.
-    Url,
-    /// The error of the operating system.
-    Io(std::io::Error),
-    /// Other hosts reach the address, and the OPC UA libraries are unpatched.
-    AsPublished(OtherHosts),
-}
-
-impl ListenFault {
-    /// Returns whether another program listens at the address.
-    pub(crate) fn is_taken(&self) -> bool {
-        matches!(self, Self::Io(error) if error.kind() == ErrorKind::AddrInUse)
-    }
-
-    /// Converts the error into a failure of `ua-lds`. Queries the program that uses the address for
-    /// its identity.
-    async fn told(self, endpoint: &str) -> Failure {
-        let error = match &self {
-            Self::Url => {
-                let message = format!(
-                    "--endpoint {endpoint}: expected a URL such as opc.tcp://127.0.0.1:4840"
-                );
-                return Failure::new(FailureKind::Usage, message);
-            }
-            Self::AsPublished(error) => {
-                return Failure::new(FailureKind::Configuration, error.to_string());
-            }
-            Self::Io(error) => error,
-        };
-        let who = if self.is_taken() {
-            client::find_servers(endpoint, WHO_LIMIT).await.ok()
-        } else {
-            None
-        };
-        let who = who.and_then(|all| all.into_iter().find(|one| one.is_discovery_server));
-        let what = match who {
-            Some(one) => format!(
-                "the discovery server \"{}\" ({}) already listens there: stop it or the program that \
-                 contains it, or give another --endpoint",
-                cut(&one.name),
-                cut(&one.application_uri)
-            ),
-            None => {
-                "if another discovery server runs on this host, give another --endpoint".to_owned()
-            }
-        };
-        let message = format!("cannot listen at {endpoint}: {error}; {what}");
-        Failure::new(FailureKind::Unavailable, message)
-    }
-}
-
-impl std::fmt::Display for ListenFault {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Url => f.write_str("expected a URL such as opc.tcp://host:port"),
-            Self::Io(error) => error.fmt(f),
-            Self::AsPublished(error) => error.fmt(f),
-        }
-    }
-}
-
 /// Returns the host of the own URL. A server on the wildcard address uses the address of the
 /// interface.
 fn own_host(host: &str, interface: &Interface) -> String {
@@ -767,14 +742,12 @@ fn own_host(host: &str, interface: &Interface) -> String {
     }
 }
 
-/// Listens at the address of a URL.
-pub(crate) async fn listen(endpoint: &str) -> Result<(TcpListener, Url), ListenFault> {
-    let place = Url::parse(endpoint).ok_or(ListenFault::Url)?;
-    let addresses = tokio::net::lookup_host((place.host.as_str(), place.port)).await;
-    let addresses: Vec<SocketAddr> = addresses.map_err(ListenFault::Io)?.collect();
-    plant_opcua::patches::check(&addresses).map_err(ListenFault::AsPublished)?;
-    let listener = TcpListener::bind(addresses.as_slice()).await;
-    Ok((listener.map_err(ListenFault::Io)?, place))
+/// Waits until a Global Discovery Server lists other servers, and returns its servers.
+async fn listed(listing: &mut Option<ListingTask>) -> Vec<Announcement> {
+    match listing {
+        Some(listing) => listing.step().await,
+        None => std::future::pending().await,
+    }
 }
 
 /// Returns the servers of other levels with these URIs, or all, in the form of registrations.
@@ -795,15 +768,9 @@ fn gated(around: &Around, uris: &[&str]) -> Vec<Asked> {
     gated.collect()
 }
 
-/// Truncates an external text for the log.
-fn cut(text: &str) -> String {
-    text.chars().take(256).collect()
-}
-
 const NAME: &str = "UA bridge discovery server";
 /// The default of most discovery servers.
 const REGISTER_EVERY: Duration = Duration::from_secs(600);
-const WHO_LIMIT: Duration = Duration::from_secs(1);
 const MOST_LOSSES: usize = 64;
 const SEMAPHORES_EVERY: Duration = Duration::from_secs(5);
 const LEAVE_LIMIT: Duration = Duration::from_secs(1);

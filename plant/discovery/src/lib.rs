@@ -7,8 +7,8 @@
 //! Reading order: `address` (the registered address), `wire` (OPC UA over TCP), `client` (queries),
 //! `line` and `liveness` (probes of servers), `keeper` (a registry with its inputs and outputs),
 //! `watch`, `scan`, `chosen` and `announce` (the interface for programs), `endpoint`, `connection`,
-//! `security` and `services` (the endpoint of the discovery server), `lds`, `embedded` (the
-//! discovery server within another program), `presence`.
+//! `security` and `services` (the endpoint of the discovery server), `listing` (queries of a Global
+//! Discovery Server), `lds`, `embedded` (the discovery server within another program), `presence`.
 
 mod address;
 mod announce;
@@ -23,6 +23,8 @@ pub mod fuzz;
 mod keeper;
 pub mod lds;
 mod line;
+mod listen;
+mod listing;
 mod liveness;
 mod presence;
 pub mod scan;
@@ -34,6 +36,7 @@ mod wire;
 
 pub use announce::{AnnounceSettings, AnnounceState, Announced, Server, announce};
 pub use chosen::{Marks, find_lds};
+pub use listing::{ListingArguments, ServerQuery};
 pub use mdns::{Interface, MdnsFault, host_name};
 pub use presence::be_there;
 /// The detected cause of the loss of a server.

@@ -11,6 +11,7 @@ use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::pki::default_named;
 
 use crate::lds::{self, LdsSettings};
+use crate::listing::ListingArguments;
 use crate::scan::Range;
 use crate::{DEFAULT_LDS, Interface};
 
@@ -55,6 +56,8 @@ struct UaLds {
     pki: Option<PathBuf>,
     #[command(flatten)]
     gds: GdsArguments,
+    #[command(flatten)]
+    listing: ListingArguments,
     /// Trust every client certificate. For tests and demonstrations only
     #[arg(long, requires = "pki")]
     trust_any_client_certificate: bool,
@@ -101,6 +104,7 @@ impl Service for UaLds {
             secured_only: self.secured_only,
             register_every: Duration::from_secs(self.register_period.into()),
             pki: self.pki.or_else(usual),
+            listing: self.listing.query(gds.as_ref()),
             gds,
             trust_any: self.trust_any_client_certificate,
             ..LdsSettings::at(self.endpoint)

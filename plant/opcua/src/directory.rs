@@ -7,8 +7,8 @@ use std::sync::{Arc, LazyLock};
 use opcua::types::{
     ApplicationType, BinaryDecodable, BinaryEncodable, ByteString, ContextOwned,
     ExpandedMessageInfo, ExpandedNodeId, ExtensionObject, LocalizedText, MethodId, NodeId,
-    StaticTypeLoader, TrustListDataType, TypeLoaderInstance, UAString, UaNullable, Variant,
-    XmlDecodable, XmlEncodable, XmlType, binary_decode_to_enc,
+    ServerOnNetwork, StaticTypeLoader, TrustListDataType, TypeLoaderInstance, UAString, UaNullable,
+    Variant, XmlDecodable, XmlEncodable, XmlType, binary_decode_to_enc,
 };
 use trust::{Certificate, Crl, Request};
 
@@ -193,6 +193,53 @@ impl Directory {
         }
     }
 
+    /// Returns the servers whose names match a pattern, up to a limit: QueryServers (OPC 10000-12,
+    /// 6.6.11). `%` stands for any text and `_` for any character.
+    ///
+    /// # Errors
+    /// Returns an error if a call fails.
+    pub async fn servers(
+        &self,
+        pattern: &str,
+        most: usize,
+    ) -> Result<Vec<ServerOnNetwork>, DirectoryError> {
+        let mut found = Vec::new();
+        let mut after = 0;
+        loop {
+            let arguments = vec![
+                Variant::UInt32(after),
+                Variant::UInt32(PAGE),
+                Variant::String(pattern.into()),
+                Variant::String(UAString::null()),
+                Variant::String(UAString::null()),
+                Variant::from(Vec::<UAString>::new()),
+            ];
+            let answer = self.call(QUERY_SERVERS, arguments).await?;
+            let page = match answer.into_iter().nth(1) {
+                Some(Variant::Array(page)) => page.values,
+                // The server may send an empty list as null.
+                Some(Variant::Empty) => Vec::new(),
+                _ => return Err(DirectoryError::Answer("QueryServers")),
+            };
+            let mut last = after;
+            for one in page {
+                let Variant::ExtensionObject(object) = one else {
+                    return Err(DirectoryError::Answer("QueryServers"));
+                };
+                let server = object.into_inner_as::<ServerOnNetwork>();
+                let server = server.ok_or(DirectoryError::Answer("QueryServers"))?;
+                last = last.max(server.record_id);
+                found.push(*server);
+            }
+            // Only records with a larger number follow, so that the queries end.
+            if last == after || found.len() >= most {
+                found.truncate(most);
+                return Ok(found);
+            }
+            after = last;
+        }
+    }
+
     /// Requests a certificate, and returns the number of the request.
     ///
     /// # Errors
@@ -343,9 +390,12 @@ const DIRECTORY: u32 = 141;
 const FIND_APPLICATIONS: (u32, &str) = (143, "FindApplications");
 const REGISTER_APPLICATION: (u32, &str) = (146, "RegisterApplication");
 const UPDATE_APPLICATION: (u32, &str) = (200, "UpdateApplication");
+const QUERY_SERVERS: (u32, &str) = (151, "QueryServers");
 const START_SIGNING_REQUEST: (u32, &str) = (157, "StartSigningRequest");
 const FINISH_REQUEST: (u32, &str) = (163, "FinishRequest");
 const GET_TRUST_LIST: (u32, &str) = (204, "GetTrustList");
+/// Number of servers per QueryServers call.
+const PAGE: u32 = 100;
 /// The open mode for reading.
 const READ: u8 = 1;
 /// Bytes per Read call.

@@ -15,7 +15,7 @@ mod invitation;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use opcua::types::{ApplicationType, NodeId, StatusCode};
+use opcua::types::{ApplicationType, NodeId, ServerOnNetwork, StatusCode};
 use tokio::time::{Instant, sleep, timeout};
 use tracing::{debug, info, warn};
 use trust::{Certificate, Renewal, Request, Step};
@@ -208,42 +208,29 @@ impl Enrolment {
     /// Connects to the Global Discovery Server, requests a certificate to replace `old`, and
     /// fetches the trust list.
     async fn visit(&mut self, old: Option<&Certificate>) -> Result<Visit, Why> {
-        let client = Client::open(
-            ClientConfig {
-                pki: Some(self.root.clone()),
-                pinned: self.gds.fingerprint,
-                allow_outdated_lists: true,
-                security: SecurityChoice::Best,
-                timeout: ANSWERS_WITHIN,
-                ..ClientConfig::new(&self.applicant.application_uri, &self.applicant.name)
-            },
-            &self.gds.url,
-        );
-        let visited = timeout(LONGEST_VISIT, self.ask(&client, old)).await;
-        client.close().await;
-        visited.unwrap_or_else(|_| {
-            Err(format!(
-                "the server has not responded within {LONGEST_VISIT:?}"
-            ))
-        })
+        let client = DirectoryClient {
+            root: self.root.clone(),
+            application_uri: self.applicant.application_uri.clone(),
+            name: self.applicant.name.clone(),
+            gds: self.gds.clone(),
+        };
+        let ask = async |directory: Directory| self.ask(&directory, old).await;
+        client.visit(ask).await
     }
 
-    async fn ask(&mut self, client: &Client, old: Option<&Certificate>) -> Result<Visit, Why> {
+    async fn ask(
+        &mut self,
+        directory: &Directory,
+        old: Option<&Certificate>,
+    ) -> Result<Visit, Why> {
         let text = |error: DirectoryError| error.to_string();
-        let up = client.up(ANSWERS_WITHIN).await;
-        up.map_err(|error| error.to_string())?;
-        // Without verification of the server's certificate, any server could issue a certificate.
-        if !matches!(&*client.link().borrow(), Link::Up { secured: true, .. }) {
-            return Err("the server offers no secured channel".to_owned());
-        }
-        let directory = Directory::of(client).map_err(text)?;
         let issued = match old {
-            Some(old) => match self.issued(&directory, old).await? {
+            Some(old) => match self.issued(directory, old).await? {
                 Some(issued) => Some(issued),
                 None if old.is_self_signed() => return Ok(Visit::Waiting),
                 None => {
                     // A renewal may wait for weeks, in which certificates of others are revoked.
-                    if let Ok(lists) = self.lists(&directory).await {
+                    if let Ok(lists) = self.lists(directory).await {
                         self.trust(&lists)?;
                     }
                     return Ok(Visit::Waiting);
@@ -251,7 +238,7 @@ impl Enrolment {
             },
             None => None,
         };
-        let lists = self.lists(&directory).await.map_err(text)?;
+        let lists = self.lists(directory).await.map_err(text)?;
         let is_first = !known::trusts_authorities(&self.root);
         // The trust list comes first: the certificate is useless until its authority is trusted
         // here.
@@ -415,6 +402,73 @@ impl Enrolment {
             "restarting with the certificate of the plant"
         );
         Ok(())
+    }
+}
+
+/// A client of the Directory of a Global Discovery Server, with the certificate store of its
+/// program.
+#[derive(Debug, Clone)]
+pub struct DirectoryClient {
+    /// The certificate store.
+    pub root: PathBuf,
+    /// The ApplicationUri.
+    pub application_uri: String,
+    /// The application name.
+    pub name: String,
+    /// The Global Discovery Server.
+    pub gds: Invitation,
+}
+
+impl DirectoryClient {
+    /// Returns the registered servers whose names match a pattern, up to a limit.
+    ///
+    /// # Errors
+    /// The reason: the server is unreachable, slow or untrusted, or its answer is invalid.
+    pub async fn servers(
+        &self,
+        pattern: &str,
+        most: usize,
+    ) -> Result<Vec<ServerOnNetwork>, String> {
+        let ask = async |directory: Directory| {
+            let servers = directory.servers(pattern, most).await;
+            servers.map_err(|error| error.to_string())
+        };
+        self.visit(ask).await
+    }
+
+    /// Connects over a secured channel, sends requests, and disconnects, all within a time limit.
+    async fn visit<T>(
+        &self,
+        requests: impl AsyncFnOnce(Directory) -> Result<T, Why>,
+    ) -> Result<T, Why> {
+        let client = Client::open(
+            ClientConfig {
+                pki: Some(self.root.clone()),
+                pinned: self.gds.fingerprint,
+                allow_outdated_lists: true,
+                security: SecurityChoice::Best,
+                timeout: ANSWERS_WITHIN,
+                ..ClientConfig::new(&self.application_uri, &self.name)
+            },
+            &self.gds.url,
+        );
+        let visit = async {
+            let up = client.up(ANSWERS_WITHIN).await;
+            up.map_err(|error| error.to_string())?;
+            // Without verification of the server's certificate, any server could answer.
+            if !matches!(&*client.link().borrow(), Link::Up { secured: true, .. }) {
+                return Err("the server offers no secured channel".to_owned());
+            }
+            let directory = Directory::of(&client).map_err(|error| error.to_string())?;
+            requests(directory).await
+        };
+        let visited = timeout(LONGEST_VISIT, visit).await;
+        client.close().await;
+        visited.unwrap_or_else(|_| {
+            Err(format!(
+                "the server has not responded within {LONGEST_VISIT:?}"
+            ))
+        })
     }
 }
 
