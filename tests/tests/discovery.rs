@@ -7,6 +7,7 @@ mod enrolment;
 mod faults;
 mod gds;
 mod levels;
+mod listed;
 mod presence;
 mod rules;
 mod space;
