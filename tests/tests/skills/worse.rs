@@ -3,7 +3,8 @@
 
 use std::time::Duration;
 
-use skills::{ClientOptions, SkillClient, SkillHandle, TypeName};
+use discovery::{Interface, WatchSettings};
+use skills::{ClientOptions, Detector, SkillClient, SkillHandle, TypeName};
 use system_tests::{Cell, HERE, Started, THERE, WIRE, Wire, program};
 use tokio::time::{Instant, sleep};
 
@@ -105,3 +106,52 @@ fn runs_over_a_lossy_and_slow_link_happen_once_each_and_their_outcomes_are_known
         client.close().await;
     });
 }
+
+#[test]
+fn a_component_and_its_skills_are_found_over_a_lossy_and_slow_link() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let host = cell.host(Wire {
+        loss: 0.05,
+        delay: Duration::from_millis(50),
+    });
+    on_this_host(async || {
+        let settings = WatchSettings {
+            mdns: Some(Interface::parse(WIRE)),
+            ..WatchSettings::default()
+        };
+        let mut watcher = discovery::watch(settings).unwrap();
+        let detector = Detector::new(ClientOptions {
+            within: Duration::from_secs(10),
+            ..ClientOptions::default()
+        });
+        let began = Instant::now();
+        let _component = far(&cell).on(&host).start();
+        let mut announced = None;
+        let mut changes = detector.changes();
+        while detector
+            .of_type(&TypeName::own("GraspSkillType"))
+            .is_empty()
+        {
+            tokio::select! {
+                found = watcher.next() => match found.unwrap() {
+                    discovery::Found::Seen(known) => {
+                        announced.get_or_insert_with(|| began.elapsed());
+                        detector.seen(&known.name, &known.url);
+                    }
+                    discovery::Found::Restarted(_) => {}
+                    discovery::Found::Gone { known, loss } => panic!("{known:?}: {loss:?}"),
+                },
+                changed = changes.changed() => changed.unwrap(),
+                () = sleep(FOUND_WITHIN) => {}
+            }
+            assert!(began.elapsed() < FOUND_WITHIN, "{announced:?}");
+        }
+        println!(
+            "announced after {announced:?}, its skill after {:?}",
+            began.elapsed()
+        );
+    });
+}
+
+/// Time from the start of a component to its first skill, on a loaded machine.
+const FOUND_WITHIN: Duration = Duration::from_secs(20);
