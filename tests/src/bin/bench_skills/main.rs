@@ -1,8 +1,10 @@
 //! `cargo xtask bench skills`: the delays of a client, the duration of a skill's methods compared
-//! with a plain method, many skills in a server, and many devices below a station.
+//! with a plain method, many skills in a server, many devices below a station, and the round trips
+//! of a skill beside those of services, methods and values.
 
 mod crowd;
 mod finding;
+mod rtt;
 
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -36,10 +38,11 @@ fn main() -> ExitCode {
         print!("{HELP}");
         return ExitCode::SUCCESS;
     }
-    let measured = match (is_finding, is_station) {
-        (true, _) => Some(finding::all(runs, servers)),
-        (false, true) => Some(crowd::all(devices, skills, runs)),
-        (false, false) => None,
+    let measured = match args.first().map(String::as_str) {
+        Some("finding") => Some(finding::all(runs, servers)),
+        Some("station") => Some(crowd::all(devices, skills, runs)),
+        Some("rtt") => Some(rtt::all(runs)),
+        Some(_) | None => None,
     };
     if let Some(measured) = measured {
         return measured.map_or(ExitCode::FAILURE, |()| ExitCode::SUCCESS);
@@ -65,8 +68,9 @@ const HELP: &str = "\
 cargo xtask bench skills [--runs N] [--skills N]
 cargo xtask bench skills finding [--runs N] [--servers N]
 cargo xtask bench skills station [--devices N] [--skills N] [--runs N]
+cargo xtask bench skills rtt [--runs N]
 
-  --runs N     runs and calls of each kind (200); servers that are plugged in (20)
+  --runs N     runs, calls and round trips of each kind (200); servers that are plugged in (20)
   --skills N   skills in one server (1000), or in each device (20)
   --servers N  servers that register with one discovery server (500)
   --devices N  devices below one station (100)
