@@ -52,6 +52,38 @@ pub(crate) fn publisher(message: &NetworkMessage<'_>) -> Option<u16> {
     }
 }
 
+/// Returns whether the type, the group and the writer of a message are those of its topic, as far
+/// as the topic names them.
+pub(crate) fn agrees(network: &NetworkMessage<'_>, address: Address) -> bool {
+    let kind = address.kind;
+    let is_call = matches!(
+        kind,
+        TopicMessageType::ActionRequest | TopicMessageType::ActionResponse
+    );
+    match network.message_type() {
+        NetworkMessageType::Probe => return kind == TopicMessageType::Probe,
+        NetworkMessageType::Announcement => {
+            return !is_call && !matches!(kind, TopicMessageType::Data | TopicMessageType::Probe);
+        }
+        NetworkMessageType::DataSet => {}
+    }
+    let found = of(network, None).map(|found| found.address.kind);
+    // A sealed message or a chunk does not show whether it is a request or a response.
+    let is_hidden = is_call && (network.is_sealed() || network.is_chunk());
+    if found != Some(kind) && !(is_hidden && found == Some(TopicMessageType::ActionRequest)) {
+        return false;
+    }
+    let group = network.group().and_then(|group| group.writer_group_id);
+    let is_group = address.group.is_none_or(|wanted| group == Some(wanted));
+    let is_writer = address
+        .writer
+        .is_none_or(|wanted| match network.writer_ids() {
+            Some(mut writers) => writers.all(|id| id == wanted),
+            None => !is_call,
+        });
+    is_group && is_writer
+}
+
 /// Returns the status in a message.
 pub(crate) fn status(
     message: &NetworkMessage<'_>,
@@ -72,7 +104,8 @@ pub(crate) fn status(
     }
 }
 
-const fn alone(kind: TopicMessageType, publisher: u16) -> Address {
+/// Returns the ids of a message without a group and a writer.
+pub(crate) const fn alone(kind: TopicMessageType, publisher: u16) -> Address {
     Address {
         kind,
         publisher,
@@ -234,6 +267,28 @@ mod tests {
             let is_withdrawn = kind == TopicMessageType::Discovery;
             assert_eq!(withdrawn.is_some(), is_withdrawn);
             assert_eq!(address.writer.is_some(), !is_withdrawn);
+        }
+    }
+
+    #[test]
+    fn a_value_is_accepted_at_the_topic_of_its_writer_only() {
+        let bytes = value(&[10]);
+        let message = NetworkMessage::decode(&bytes).unwrap();
+        for kind in TopicMessageType::ALL {
+            let address = Address {
+                kind,
+                publisher: 1,
+                group: Some(2),
+                writer: Some(10),
+            };
+            let is_data = kind == TopicMessageType::Data;
+            assert_eq!(agrees(&message, address), is_data, "{kind:?}");
+            let other = Address {
+                writer: Some(11),
+                ..address
+            };
+            assert!(!agrees(&message, other), "{kind:?}");
+            assert_eq!(agrees(&message, alone(kind, 1)), is_data, "{kind:?}");
         }
     }
 }

@@ -13,9 +13,9 @@ use tokio::sync::mpsc;
 use tokio::time::{Sleep, sleep};
 use transport::{Carrier, CarrierChange, Outgoing, Received, SendError, Senders};
 use uadp::discovery::ConnectionState;
-use uadp::{NetworkMessage, NetworkMessageType, Timestamp};
+use uadp::{NetworkMessage, Timestamp};
 
-use crate::address::{self, Addressed};
+use crate::address::{self, Addressed, alone};
 use crate::connection::{BrokerLink, ConnectionShared, SharedState, instant, run};
 use crate::echo::Echo;
 use crate::json::Json;
@@ -104,8 +104,9 @@ impl Mqtt {
             topic: topics::name(broker, encoding, address),
             payload,
             retained,
-            confirmed: retained || (is_value && broker.at_least_once),
+            confirmed: broker.at_least_once && (retained || is_value),
             replaceable: retained,
+            outlasts: false,
             within: retained.then_some(RETAINED),
             message_type: message_type(address.kind),
             content_type: if encoding == JSON {
@@ -151,6 +152,7 @@ impl Mqtt {
             retained: true,
             confirmed: true,
             replaceable: true,
+            outlasts: false,
             within: None,
             message_type: "",
             content_type: "",
@@ -223,7 +225,9 @@ impl Mqtt {
             return Ok(true);
         };
         // The access rules of a broker refer to topics.
-        if address::publisher(&network) != Some(publisher) || !agrees(&network, read.address) {
+        if address::publisher(&network) != Some(publisher)
+            || !address::agrees(&network, read.address)
+        {
             return Err("other_publisher");
         }
         let now = instant();
@@ -365,8 +369,10 @@ impl Mqtt {
     }
 
     /// Publishes a message that the broker keeps, as UADP, and as JSON if the mapping wants JSON.
-    fn announce(&mut self, network: &NetworkMessage<'_>, address: Address) {
-        let uadp = self.publication(UADP, address, network.datagram().to_vec());
+    /// A message that `is_repeated` soon needs no confirmation by the broker.
+    fn announce(&mut self, network: &NetworkMessage<'_>, address: Address, is_repeated: bool) {
+        let mut uadp = self.publication(UADP, address, network.datagram().to_vec());
+        uadp.confirmed &= !is_repeated;
         self.keep(uadp);
         if !self.writes_json() {
             return;
@@ -379,15 +385,17 @@ impl Mqtt {
             _ => None,
         };
         if let Some(json) = json {
-            let publication = self.publication(JSON, address, json);
+            let mut publication = self.publication(JSON, address, json);
+            publication.confirmed &= !is_repeated;
             self.keep(publication);
         }
     }
 
     /// Publishes the own status.
-    fn announce_status(&mut self, publisher: u16, status: &[u8]) {
+    fn announce_status(&mut self, publisher: u16, status: &[u8], is_repeated: bool) {
         if let Ok(network) = NetworkMessage::decode(status) {
-            self.announce(&network, alone(TopicMessageType::Status, publisher));
+            let address = alone(TopicMessageType::Status, publisher);
+            self.announce(&network, address, is_repeated);
         }
     }
 
@@ -398,7 +406,10 @@ impl Mqtt {
         };
         let now = instant();
         if let Some(status) = self.reports.status(publisher, (now, utc())) {
-            self.announce_status(publisher, &status);
+            // NATS ends the connection of a client whose message with QoS 1 it cannot store in
+            // 4 s, so a cyclic status would end each connection while there is no leader.
+            let is_cyclic = self.settings.will.is_none();
+            self.announce_status(publisher, &status, is_cyclic);
         }
         if publisher != 0
             && let Some(connection) = self.reports.connection(publisher, now)
@@ -443,7 +454,7 @@ impl Carrier for Mqtt {
             self.withdraw(topic);
         }
         if address.kind.is_retained() {
-            self.announce(&network, address);
+            self.announce(&network, address, false);
             return Ok(());
         }
         // A forwarded value is of another publisher.
@@ -462,15 +473,19 @@ impl Carrier for Mqtt {
         publication.replaceable = message.replaceable && !network.is_chunk();
         publication.within = message.within;
         // Commands are never queued for an absent reader.
-        publication.confirmed &= message.replaceable;
+        publication.confirmed &= message.replaceable && !message.command;
+        // The time bounds the wait.
+        publication.outlasts =
+            publication.replaceable && !message.command && message.within.is_some();
         let mut state = self.shared.state();
-        let BrokerLink::Connected {
-            version,
-            max_packet,
-            ..
-        } = state.link
-        else {
-            return Err(SendError::Unreachable);
+        let (version, max_packet) = match state.link {
+            BrokerLink::Connected {
+                version,
+                max_packet,
+                ..
+            } => (version, max_packet),
+            BrokerLink::Waiting(_) if publication.outlasts => (MqttVersion::V3_1_1, None),
+            BrokerLink::Waiting(_) => return Err(SendError::Unreachable),
         };
         let size = publication.payload.len() + publication.topic.len() + OVERHEAD;
         if max_packet.is_some_and(|most| u32::try_from(size).is_ok_and(|size| size > most)) {
@@ -568,6 +583,8 @@ impl Carrier for Mqtt {
             ("queue_expired", state.queue.expired),
             ("queue_replaced", state.queue.replaced),
             ("connection_lost", state.queue.discarded),
+            ("not_confirmed", state.queue.unconfirmed),
+            ("packet_refused", state.queue.refused),
             ("received_overflow", state.overflow),
         ];
         let received = self.dropped.iter().map(|(reason, count)| (*reason, *count));
@@ -592,7 +609,7 @@ impl Carrier for Mqtt {
         if let Some(publisher) = self.settings.publisher
             && let Some(last) = self.reports.last_status(publisher)
         {
-            self.announce_status(publisher, &last);
+            self.announce_status(publisher, &last, false);
         }
         self.shared.close();
     }
@@ -616,47 +633,6 @@ impl Carrier for Mqtt {
 impl Drop for Mqtt {
     fn drop(&mut self) {
         self.shared.close();
-    }
-}
-
-/// Returns whether the type, the group and the writer of a message are those of its topic, as far
-/// as the topic names them.
-fn agrees(network: &NetworkMessage<'_>, address: Address) -> bool {
-    let kind = address.kind;
-    let is_call = matches!(
-        kind,
-        TopicMessageType::ActionRequest | TopicMessageType::ActionResponse
-    );
-    match network.message_type() {
-        NetworkMessageType::Probe => return kind == TopicMessageType::Probe,
-        NetworkMessageType::Announcement => {
-            return !is_call && !matches!(kind, TopicMessageType::Data | TopicMessageType::Probe);
-        }
-        NetworkMessageType::DataSet => {}
-    }
-    let found = address::of(network, None).map(|of| of.address.kind);
-    // A sealed message or a chunk does not show whether it is a request or a response.
-    let is_hidden = is_call && (network.is_sealed() || network.is_chunk());
-    if found != Some(kind) && !(is_hidden && found == Some(TopicMessageType::ActionRequest)) {
-        return false;
-    }
-    let group = network.group().and_then(|group| group.writer_group_id);
-    let is_group = address.group.is_none_or(|wanted| group == Some(wanted));
-    let is_writer = address
-        .writer
-        .is_none_or(|wanted| match network.writer_ids() {
-            Some(mut writers) => writers.all(|id| id == wanted),
-            None => !is_call,
-        });
-    is_group && is_writer
-}
-
-const fn alone(kind: TopicMessageType, publisher: u16) -> Address {
-    Address {
-        kind,
-        publisher,
-        group: None,
-        writer: None,
     }
 }
 
@@ -699,43 +675,3 @@ const LONGEST_TOPIC: usize = 64;
 const MAX_RECEIVED: usize = 4096;
 const MAX_KEPT: usize = 65_536;
 const CLOSED_POLL: Duration = Duration::from_millis(10);
-
-#[cfg(test)]
-mod tests {
-    use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId};
-
-    use super::*;
-
-    #[test]
-    fn a_value_is_accepted_at_the_topic_of_its_writer_only() {
-        let network = NetworkHeader {
-            publisher_id: Some(PublisherId::UInt16(1)),
-            group: Some(GroupHeader {
-                writer_group_id: Some(2),
-                ..GroupHeader::default()
-            }),
-            ..NetworkHeader::default()
-        };
-        let mut bytes = Vec::new();
-        let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&[10])).unwrap();
-        message.keep_alive(&DataSetHeader::default()).unwrap();
-        message.finish().unwrap();
-        let message = NetworkMessage::decode(&bytes).unwrap();
-        for kind in TopicMessageType::ALL {
-            let address = Address {
-                kind,
-                publisher: 1,
-                group: Some(2),
-                writer: Some(10),
-            };
-            let is_data = kind == TopicMessageType::Data;
-            assert_eq!(agrees(&message, address), is_data, "{kind:?}");
-            let other = Address {
-                writer: Some(11),
-                ..address
-            };
-            assert!(!agrees(&message, other), "{kind:?}");
-            assert_eq!(agrees(&message, alone(kind, 1)), is_data, "{kind:?}");
-        }
-    }
-}

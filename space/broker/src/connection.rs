@@ -1,6 +1,6 @@
 //! The connection with the broker: a task that reconnects.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,9 +18,10 @@ use tokio::time::{Instant as TokioInstant, sleep, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
 use crate::packets::{self, ConnectAck, PacketEvent, ReceivedPublish};
-use crate::queue::{QueuedPublish, SendQueue};
+use crate::queue::{QueuedMessage, QueuedPublish, SendQueue};
 use crate::settings::{BrokerSettings, random};
 use crate::stream::{BrokerStream, connect};
+use crate::subscriptions::{Response, Subscriptions};
 
 /// The state that the task shares with the carrier.
 #[derive(Debug, Default)]
@@ -82,10 +83,11 @@ impl ConnectionShared {
         self.wake.notify_one();
     }
 
-    /// Records that there is no connection. Returns false if the connection is to be closed.
-    fn waits(&self, why: &str) -> bool {
+    /// Records that there is no connection, and what the last connection had not sent. Returns
+    /// false if the connection is to be closed.
+    fn waits(&self, why: &str, unsent: Unsent) -> bool {
         let mut state = self.state();
-        state.queue.discard();
+        state.queue.lose(unsent.in_flight, unsent.unwritten);
         state.link = BrokerLink::Waiting(why.to_owned());
         !state.closing
     }
@@ -100,6 +102,14 @@ impl ConnectionShared {
     pub(crate) fn is_closed(&self) -> bool {
         self.state().closed
     }
+}
+
+/// The messages that a connection had not sent when it ended.
+struct Unsent {
+    /// Messages without a confirmation, in their order.
+    in_flight: Vec<QueuedMessage>,
+    /// Number of messages that were not written and need no confirmation.
+    unwritten: usize,
 }
 
 /// The reason why a connection ended.
@@ -132,7 +142,9 @@ pub(crate) async fn run(
             pause = FIRST_PAUSE;
         }
         match ended {
-            Ended::Lost(why) if !received.is_closed() && shared.waits(&why) => {
+            Ended::Lost(why)
+                if !received.is_closed() && shared.waits(&why, session.take_unsent()) =>
+            {
                 debug!(broker = %settings.broker.address, "cannot connect: {why}");
             }
             Ended::Lost(_) | Ended::Closed => return shared.closed(),
@@ -155,17 +167,19 @@ struct Session<'a> {
     protocol: mqtt::Connection<mqtt::role::Client>,
     /// Bytes to write, and the number of them that are written.
     out: (Vec<u8>, usize),
+    /// The ends in the bytes to write of the messages that need no confirmation.
+    unconfirmed_ends: Vec<usize>,
     timers: BTreeMap<u8, (TimerKind, TokioInstant)>,
     /// The time of the next ping.
     next_ping: TokioInstant,
     /// The time of the first ping after which nothing was received.
     unanswered: Option<TokioInstant>,
-    /// Packet identifiers of publications that the broker has not confirmed.
-    unconfirmed: BTreeSet<u16>,
+    /// Publications that the broker has not confirmed, by their packet identifiers and in their
+    /// order; at most [`MAX_UNCONFIRMED`].
+    in_flight: VecDeque<(u16, QueuedMessage)>,
     /// Whether the broker has accepted the connection.
     accepted: Option<ConnectAck>,
-    /// Packet identifiers of subscriptions that the broker has not confirmed.
-    subscribing: BTreeSet<u16>,
+    subscriptions: Subscriptions,
     at: SocketAddr,
     refuses_version: bool,
     over: Option<String>,
@@ -194,12 +208,13 @@ impl<'a> Session<'a> {
             version,
             protocol,
             out: (Vec::new(), 0),
+            unconfirmed_ends: Vec::new(),
             timers: BTreeMap::new(),
             next_ping: TokioInstant::now() + PING,
             unanswered: None,
-            unconfirmed: BTreeSet::new(),
+            in_flight: VecDeque::new(),
             accepted: None,
-            subscribing: BTreeSet::new(),
+            subscriptions: Subscriptions::default(),
             at: SocketAddr::from(([0, 0, 0, 0], 0)),
             refuses_version: false,
             over: None,
@@ -292,7 +307,7 @@ impl<'a> Session<'a> {
                     if !connected && TokioInstant::now() >= ready {
                         return Ended::Lost("the broker does not respond".to_owned());
                     }
-                    self.fire();
+                    self.fire(TokioInstant::now());
                 }
                 () = self.shared.wake.notified(), if !pending => {}
             }
@@ -305,7 +320,9 @@ impl<'a> Session<'a> {
         let timers = self.timers.values().map(|(_, at)| *at);
         let stalled = self.unanswered.map(|since| since + self.patience());
         let ping = ready.is_none().then_some(self.next_ping);
-        let all = timers.chain(stalled).chain(ready).chain(ping);
+        let retry = self.subscriptions.poll_timeout().map(TokioInstant::from);
+        let retry = retry.filter(|_| ready.is_none());
+        let all = timers.chain(stalled).chain(ready).chain(ping).chain(retry);
         all.min().unwrap_or(self.next_ping)
     }
 
@@ -324,6 +341,17 @@ impl<'a> Session<'a> {
         if self.out.1 >= self.out.0.len() {
             self.out.0.clear();
             self.out.1 = 0;
+            self.unconfirmed_ends.clear();
+        }
+    }
+
+    /// Takes the messages that were not sent.
+    fn take_unsent(&mut self) -> Unsent {
+        let (_, written) = self.out;
+        let ends = self.unconfirmed_ends.iter();
+        Unsent {
+            unwritten: ends.filter(|end| **end > written).count(),
+            in_flight: self.in_flight.drain(..).map(|(_, of)| of).collect(),
         }
     }
 
@@ -335,49 +363,54 @@ impl<'a> Session<'a> {
         }
         while self.out.0.len() < WRITE {
             let now = TokioInstant::now().into_std();
-            let mut state = self.shared.state();
-            let Some(waiting) = state.queue.pop(now) else {
-                return state.closing && self.out.0.is_empty();
-            };
-            let is_full = self.unconfirmed.len() >= MAX_UNCONFIRMED
+            let is_full = self.in_flight.len() >= MAX_UNCONFIRMED
                 || self.protocol.get_receive_maximum_vacancy_for_send() == Some(0);
-            if waiting.0.confirmed && is_full {
-                state.queue.unpop(waiting);
-                return false;
-            }
+            let mut state = self.shared.state();
+            let Some(message) = state.queue.pop(now, !is_full) else {
+                return state.closing && state.queue.is_empty() && self.out.0.is_empty();
+            };
             drop(state);
-            self.publish(waiting.0);
+            self.publish(message);
         }
         false
     }
 
-    fn publish(&mut self, publication: QueuedPublish) {
+    fn publish(&mut self, message: QueuedMessage) {
+        let publication = message.0.clone();
         let id = match publication.confirmed {
-            true => match self.protocol.acquire_packet_id() {
-                Ok(id) => {
-                    self.unconfirmed.insert(id);
-                    Some(id)
-                }
-                Err(_all_used) => None,
-            },
+            // All identifiers are used only if the broker confirms nothing.
+            true => self.protocol.acquire_packet_id().ok(),
             false => None,
         };
+        if let Some(id) = id {
+            self.in_flight.push_back((id, message));
+        }
         match packets::publish(publication, (self.version, id)) {
             Ok(packet) => {
                 let before = self.out.0.len();
                 self.send(packet);
                 if self.out.0.len() == before {
                     // The library refuses the packet.
-                    if let Some(id) = id {
-                        self.unconfirmed.remove(&id);
-                    }
+                    self.confirmed(id);
+                    self.shared.state().queue.refused += 1;
                     warn!(
                         "cannot publish a message: the broker does not accept its size; raise the size limit of the broker"
                     );
+                } else if id.is_none() {
+                    self.unconfirmed_ends.push(self.out.0.len());
                 }
             }
-            Err(error) => warn!(?error, "cannot publish a message to the broker"),
+            Err(error) => {
+                self.confirmed(id);
+                self.shared.state().queue.refused += 1;
+                warn!(?error, "cannot publish a message to the broker");
+            }
         }
+    }
+
+    /// Removes a publication that the broker has confirmed or will not confirm.
+    fn confirmed(&mut self, id: Option<u16>) {
+        self.in_flight.retain(|(other, _)| Some(*other) != id);
     }
 
     fn send(&mut self, packet: Packet) {
@@ -395,8 +428,7 @@ impl<'a> Session<'a> {
         }
     }
 
-    fn fire(&mut self) {
-        let now = TokioInstant::now();
+    fn fire(&mut self, now: TokioInstant) {
         let patience = self.patience();
         if self.unanswered.is_some_and(|since| now >= since + patience) {
             let seconds = patience.as_secs();
@@ -410,6 +442,9 @@ impl<'a> Session<'a> {
                 Ok(packet) => self.send(packet),
                 Err(error) => warn!(?error, "cannot ping the broker"),
             }
+        }
+        for filter in self.subscriptions.take_due(now.into_std()) {
+            self.subscribe(filter);
         }
         let due: Vec<TimerKind> = self
             .timers
@@ -432,8 +467,7 @@ impl<'a> Session<'a> {
                 }
                 GenericEvent::NotifyPacketReceived(packet) => self.packet(packet),
                 GenericEvent::NotifyPacketIdReleased(id) => {
-                    self.unconfirmed.remove(&id);
-                    self.subscribing.remove(&id);
+                    self.confirmed(Some(id));
                 }
                 GenericEvent::RequestTimerReset { kind, duration_ms } => {
                     let at = TokioInstant::now() + Duration::from_millis(duration_ms);
@@ -461,7 +495,7 @@ impl<'a> Session<'a> {
                 self.over = Some(why);
             }
             PacketEvent::Message(message) => self.messages.push(message),
-            PacketEvent::Subscribed { refused } => self.subscribed(refused),
+            PacketEvent::Subscribed { id, refused } => self.subscribed(id, refused),
             PacketEvent::Ended(why) => self.over = Some(why),
             PacketEvent::Other => {}
         }
@@ -469,49 +503,48 @@ impl<'a> Session<'a> {
 
     fn accepted(&mut self, accepted: ConnectAck) {
         self.accepted = Some(accepted);
-        for filter in &self.settings.filters {
-            let Ok(id) = self.protocol.acquire_packet_id() else {
-                return;
-            };
-            self.subscribing.insert(id);
-            match packets::subscribe(filter, (self.version, id)) {
-                Ok(packet) => self.send(packet),
-                Err(error) => {
-                    self.subscribing.remove(&id);
-                    warn!(
-                        ?error,
-                        filter = filter.name,
-                        "cannot subscribe at the broker"
-                    );
-                }
-            }
+        for filter in 0..self.settings.filters.len() {
+            self.subscribe(filter);
         }
     }
 
-    /// Counts a subscription that the broker has confirmed or refused. After the last, messages
-    /// are sent.
-    fn subscribed(&mut self, refused: bool) {
-        if refused {
-            warn!(
-                "the broker refuses a subscription: allow the client to read the topics of its prefix"
-            );
+    /// Requests a subscription.
+    fn subscribe(&mut self, filter: usize) {
+        let settings = self.settings;
+        let Some(wanted) = settings.filters.get(filter) else {
+            return;
+        };
+        let Ok(id) = self.protocol.acquire_packet_id() else {
+            return;
+        };
+        match packets::subscribe(wanted, (self.version, id)) {
+            Ok(packet) => {
+                self.subscriptions.request(id, filter);
+                self.send(packet);
+            }
+            Err(error) => warn!(
+                ?error,
+                filter = wanted.name,
+                "cannot subscribe at the broker"
+            ),
         }
+    }
+
+    /// Handles the response to a subscription. After the last response, messages are sent.
+    fn subscribed(&mut self, id: u16, refused: bool) {
+        let response = self.subscriptions.respond(id, refused, instant());
+        self.report(response);
         let Some(ConnectAck { max_packet }) = self.accepted else {
             return;
         };
-        if !self.subscribing.is_empty() || self.is_connected() {
+        if !self.subscriptions.is_settled() || self.is_connected() {
             return;
         }
         self.next_ping = TokioInstant::now() + PING;
         let mut state = self.shared.state();
         state.connections += 1;
-        state.queue.discard();
-        let now = instant();
         let SharedState { queue, kept, .. } = &mut *state;
-        for publication in kept.values() {
-            // The queue is empty, and what does not fit is published again later.
-            let _full = queue.push(publication.clone(), now).is_err();
-        }
+        queue.begin(kept.values(), instant());
         state.link = BrokerLink::Connected {
             at: self.at,
             version: self.version,
@@ -519,6 +552,25 @@ impl<'a> Session<'a> {
         };
         let broker = &self.settings.broker.address;
         info!(%broker, version = ?self.version, "connected to the MQTT broker");
+    }
+
+    /// Logs the first refusal of a subscription, and its end.
+    fn report(&self, response: Response) {
+        let name = |filter: usize| self.settings.filters.get(filter).map(|of| of.name.as_str());
+        match response {
+            Response::Refused(filter) => warn!(
+                filter = name(filter),
+                hint = "allow the client to read the topics of its prefix, or wait until the cluster has a leader",
+                "the broker refuses a subscription; it is requested again"
+            ),
+            Response::Mended(filter) => {
+                info!(
+                    filter = name(filter),
+                    "the broker confirms the subscription"
+                );
+            }
+            Response::Confirmed | Response::RefusedAgain | Response::Unknown => {}
+        }
     }
 
     /// Ends the session in order: the broker discards the will, and everything written arrives.
@@ -575,3 +627,6 @@ const READ: usize = 64 << 10;
 const WRITE: usize = 16 << 10;
 /// The most publications without confirmation; brokers accept at least 20 at a time by default.
 const MAX_UNCONFIRMED: usize = 20;
+
+#[cfg(test)]
+mod tests;

@@ -7,7 +7,8 @@
 //! A broker stores messages. Therefore:
 //! - Values, commands, requests and responses are never retained, sessions end with the
 //!   connection, and with MQTT 5 messages expire. Nothing is queued for an absent reader.
-//! - A message waits at most its time in the own queue, and not at all while the broker is away.
+//! - A message waits at most its time in the own queue. While the broker is away, only the newest
+//!   state of each topic waits.
 //! - A broker that does not answer for [`STALL`] is left with a reset, which discards the messages
 //!   that it has not read.
 //! - The receiver has to drop late messages; see [`Carrier::within`](transport::Carrier::within).
@@ -29,6 +30,7 @@ mod reports;
 mod scope;
 mod settings;
 mod stream;
+mod subscriptions;
 mod topics;
 
 pub use carrier::Mqtt;

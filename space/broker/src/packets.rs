@@ -182,6 +182,7 @@ pub(crate) enum PacketEvent {
     Message(ReceivedPublish),
     /// The broker confirmed or refused a subscription.
     Subscribed {
+        id: u16,
         refused: bool,
     },
     Ended(String),
@@ -235,12 +236,14 @@ pub(crate) fn event(packet: Packet) -> PacketEvent {
         Packet::V3_1_1Suback(packet) => {
             let codes = packet.return_codes();
             PacketEvent::Subscribed {
+                id: packet.packet_id(),
                 refused: !codes.iter().all(|code| code.is_success()),
             }
         }
         Packet::V5_0Suback(packet) => {
             let codes = packet.reason_codes();
             PacketEvent::Subscribed {
+                id: packet.packet_id(),
                 refused: !codes.iter().all(|code| code.is_success()),
             }
         }

@@ -1,6 +1,6 @@
 //! The messages that wait for the broker.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
 use transport::SendError;
@@ -15,6 +15,9 @@ pub(crate) struct QueuedPublish {
     pub(crate) confirmed: bool,
     /// Whether a newer message of the topic replaces the message.
     pub(crate) replaceable: bool,
+    /// Whether the newest message of the topic waits for the next connection if the broker is lost:
+    /// a state, but no command.
+    pub(crate) outlasts: bool,
     /// The time after which the message must not be delivered.
     pub(crate) within: Option<Duration>,
     /// User property `UAMessageType` of MQTT 5.
@@ -35,6 +38,11 @@ pub(crate) struct SendQueue {
     pub(crate) expired: u64,
     pub(crate) replaced: u64,
     pub(crate) discarded: u64,
+    /// Number of messages that a lost connection left without a confirmation, and that are not sent
+    /// again.
+    pub(crate) unconfirmed: u64,
+    /// Number of messages that no packet could carry.
+    pub(crate) refused: u64,
 }
 
 impl SendQueue {
@@ -55,39 +63,97 @@ impl SendQueue {
             self.replaced += 1;
             return Ok(());
         }
-        let bytes = self.bytes + publication.payload.len();
-        if self.waiting.len() >= MAX_WAITING || bytes > MAX_BYTES {
+        if !self.has_room(&publication) {
             return Err(SendError::Busy);
         }
-        self.bytes = bytes;
+        self.bytes += publication.payload.len();
         self.waiting.push_back((publication, until));
         Ok(())
     }
 
-    /// Returns the next message that has not expired.
-    pub(crate) fn pop(&mut self, now: Instant) -> Option<QueuedMessage> {
-        while let Some((publication, until)) = self.waiting.pop_front() {
-            self.bytes = self.bytes.saturating_sub(publication.payload.len());
-            if until.is_none_or(|until| now <= until) {
-                return Some((publication, until));
+    /// Returns the next message that has not expired. Messages to be confirmed stay while
+    /// `may_confirm` is false, because the broker confirms too slowly.
+    pub(crate) fn pop(&mut self, now: Instant, may_confirm: bool) -> Option<QueuedMessage> {
+        let mut at = 0;
+        while let Some((publication, until)) = self.waiting.get(at) {
+            let is_expired = until.is_some_and(|until| now > until);
+            if !is_expired && publication.confirmed && !may_confirm {
+                at += 1;
+                continue;
+            }
+            let message = self.waiting.remove(at)?;
+            self.bytes = self.bytes.saturating_sub(message.0.payload.len());
+            if !is_expired {
+                return Some(message);
             }
             self.expired += 1;
         }
         None
     }
 
-    /// Returns the next message to its place, because the broker confirms too slowly.
-    pub(crate) fn unpop(&mut self, waiting: QueuedMessage) {
-        self.bytes += waiting.0.payload.len();
-        self.waiting.push_front(waiting);
+    pub(crate) fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
     }
 
-    /// Discards all messages: after a reconnection they would be late.
-    pub(crate) fn discard(&mut self) {
-        self.discarded += u64::try_from(self.waiting.len()).unwrap_or(u64::MAX);
-        self.waiting.clear();
+    /// Discards the messages of a lost connection: they would be late after a reconnection. The
+    /// newest state of each topic waits for the next connection until it expires. `in_flight` are
+    /// the messages without a confirmation, `unwritten` the number of messages that were not
+    /// written and need no confirmation.
+    pub(crate) fn lose(&mut self, in_flight: Vec<QueuedMessage>, unwritten: usize) {
+        let waiting = std::mem::take(&mut self.waiting);
         self.bytes = 0;
+        self.discarded += count(unwritten);
+        let mut newest: BTreeSet<String> = BTreeSet::new();
+        let all = in_flight.into_iter().map(|message| (true, message));
+        let all: Vec<_> = all
+            .chain(waiting.into_iter().map(|of| (false, of)))
+            .collect();
+        for (is_in_flight, message) in all.into_iter().rev() {
+            let publication = &message.0;
+            if publication.outlasts && newest.insert(publication.topic.clone()) {
+                self.bytes += publication.payload.len();
+                self.waiting.push_front(message);
+                continue;
+            }
+            // The carrier publishes its retained messages with each connection.
+            let is_kept = publication.retained && !publication.payload.is_empty();
+            match is_in_flight {
+                _ if is_kept => {}
+                true => self.unconfirmed += 1,
+                false => self.discarded += 1,
+            }
+        }
     }
+
+    /// Puts messages in front of the waiting states, for a new connection.
+    pub(crate) fn begin<'a>(
+        &mut self,
+        first: impl Iterator<Item = &'a QueuedPublish>,
+        now: Instant,
+    ) {
+        let states = std::mem::take(&mut self.waiting);
+        self.bytes = 0;
+        for publication in first {
+            // What does not fit is published again later.
+            let _full = self.push(publication.clone(), now).is_err();
+        }
+        for state in states {
+            if self.has_room(&state.0) {
+                self.bytes += state.0.payload.len();
+                self.waiting.push_back(state);
+            } else {
+                self.discarded += 1;
+            }
+        }
+    }
+
+    fn has_room(&self, publication: &QueuedPublish) -> bool {
+        self.waiting.len() < MAX_WAITING && self.bytes + publication.payload.len() <= MAX_BYTES
+    }
+}
+
+fn count(number: usize) -> u64 {
+    u64::try_from(number).unwrap_or(u64::MAX)
 }
 
 const MAX_WAITING: usize = 4096;
@@ -104,6 +170,7 @@ mod tests {
             retained: false,
             confirmed: false,
             replaceable,
+            outlasts: false,
             within: within.map(Duration::from_millis),
             message_type: "ua-data",
             content_type: "application/opcua+uadp",
@@ -126,8 +193,8 @@ mod tests {
             .push(publication("metadata", None, false), start)
             .unwrap();
         let later = start + Duration::from_millis(1001);
-        assert_eq!(queue.pop(later).unwrap().0.topic, "metadata");
-        assert_eq!((queue.pop(later).is_none(), queue.expired), (true, 1));
+        assert_eq!(queue.pop(later, true).unwrap().0.topic, "metadata");
+        assert_eq!((queue.pop(later, true).is_none(), queue.expired), (true, 1));
     }
 
     #[test]
@@ -139,7 +206,7 @@ mod tests {
         }
         queue.push(publication("a", None, false), start).unwrap();
         let order: Vec<String> =
-            std::iter::from_fn(|| queue.pop(start).map(|of| of.0.topic)).collect();
+            std::iter::from_fn(|| queue.pop(start, true).map(|of| of.0.topic)).collect();
         assert_eq!(order, ["a", "b", "a"]);
         assert_eq!((queue.replaced, queue.bytes), (1, 0));
     }
@@ -153,9 +220,81 @@ mod tests {
         }
         let refused = queue.push(publication("a", None, false), start);
         assert_eq!(refused, Err(SendError::Busy));
-        queue.discard();
-        assert!(queue.waiting.is_empty());
-        assert_eq!(queue.discarded, u64::try_from(MAX_WAITING).unwrap());
+        queue.lose(Vec::new(), 2);
+        assert!(queue.is_empty());
+        assert_eq!(queue.discarded, count(MAX_WAITING) + 2);
         queue.push(publication("a", None, false), start).unwrap();
+    }
+
+    /// Returns a state whose payload is its number, and the time at which it expires.
+    fn state(topic: &str, number: u8, until: Instant) -> QueuedMessage {
+        let state = QueuedPublish {
+            payload: vec![number],
+            confirmed: true,
+            outlasts: true,
+            ..publication(topic, Some(1000), true)
+        };
+        (state, Some(until))
+    }
+
+    #[test]
+    fn after_a_lost_connection_the_newest_state_of_each_topic_is_sent_again_until_it_expires() {
+        let mut queue = SendQueue::default();
+        let start = start();
+        let within = Duration::from_millis(1000);
+        queue.push(state("a", 3, start).0, start).unwrap();
+        queue
+            .push(publication("stop", Some(1000), false), start)
+            .unwrap();
+        let early = start + within / 2;
+        let in_flight = vec![
+            state("a", 1, start),
+            state("b", 1, early),
+            state("a", 2, start),
+            state("b", 2, early),
+            (publication("event", None, false), None),
+        ];
+        queue.lose(in_flight, 0);
+        // Two states of the topic a and one of b were not confirmed, and are older; the event is
+        // not sent again, nor is the command that waited.
+        assert_eq!((queue.unconfirmed, queue.discarded), (4, 1));
+
+        let kept = QueuedPublish {
+            retained: true,
+            ..publication("metadata", None, true)
+        };
+        queue.begin(std::iter::once(&kept), start);
+        let sent = std::iter::from_fn(|| queue.pop(early, true));
+        let sent: Vec<(String, usize)> = sent
+            .map(|(of, _)| {
+                (
+                    of.topic,
+                    of.payload.first().copied().unwrap_or_default().into(),
+                )
+            })
+            .collect();
+        let wanted = [("metadata", 0), ("b", 2), ("a", 3)];
+        assert_eq!(
+            sent,
+            wanted.map(|(topic, number)| (topic.to_owned(), number))
+        );
+        assert_eq!((queue.bytes, queue.expired), (0, 0));
+
+        queue.lose(vec![state("b", 2, early)], 0);
+        assert!(queue.pop(early + within, true).is_none());
+        assert_eq!((queue.expired, queue.unconfirmed), (1, 4));
+    }
+
+    #[test]
+    fn a_command_does_not_wait_behind_states_that_the_broker_does_not_confirm() {
+        let mut queue = SendQueue::default();
+        let start = start();
+        queue.push(state("a", 1, start).0, start).unwrap();
+        queue
+            .push(publication("stop", Some(1000), false), start)
+            .unwrap();
+        assert_eq!(queue.pop(start, false).unwrap().0.topic, "stop");
+        assert!(queue.pop(start, false).is_none());
+        assert_eq!(queue.pop(start, true).unwrap().0.topic, "a");
     }
 }
