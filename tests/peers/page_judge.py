@@ -16,7 +16,7 @@ import time
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.ui import WebDriverWait
+from selenium.webdriver.support.ui import Select, WebDriverWait
 
 WIDE = (1280, 800)
 PHONE = (390, 844)
@@ -99,7 +99,7 @@ def views(judge, url, topic):
     for scheme in ["light", "dark"]:
         for size in [WIDE, PHONE]:
             judge.look(scheme, size)
-            for view in ["programs", "values", f"topic/{topic}", "map", "skills", "processes", "events", "alarms"]:
+            for view in ["programs", "values", f"topic/{topic}", "map", "skills", "processes", "knowledge", "events", "alarms"]:
                 judge.open(url, view)
                 judge.wait(f"{view} is live", lambda: judge.text("#link") == "live")
                 judge.wait(f"{view} has a title", lambda: judge.text("h1"))
@@ -324,6 +324,82 @@ variables:
         log.close()
 
 
+def knowledge(judge, binaries, folder):
+    """Queries a MES, and loads a file as an engineer, in both colours and widths."""
+    pki = folder / "knowledge-pki"
+    for name, role in [("erna", "engineer"), ("otto", "operator")]:
+        add_user(binaries, pki, name, role)
+    mes = folder / "mes.yaml"
+    mes.write_text("mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\n"
+                   "endpoint: opc.tcp://127.0.0.1:48404\nsecurity: [None]\n")
+    good, bad = folder / "arm.ttl", folder / "bad.ttl"
+    good.write_text("@prefix css: <http://www.w3id.org/hsu-aut/css#> .\n"
+                    "@prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> .\n"
+                    "<urn:arm> rdfs:label \"arm\" ; css:providesSkill <urn:arm:grasp> , <urn:arm:move> .\n"
+                    "<urn:arm:grasp> rdfs:label \"grasp\" . <urn:arm:move> rdfs:label \"move\" .\n")
+    bad.write_text("<urn:a>\n<urn:p> .\n")
+    address, asked = "127.0.0.1:9154", "127.0.0.1:9155"
+    commands = [
+        [binaries / "ua-mes", mes, "--pki", folder / "mes-pki", "--interface", "lo", "--lds", "none", "--sparql", asked],
+        [binaries / "ua-server", "--pki", pki, "--interface", "lo", "--metrics", address,
+         "--endpoint", "opc.tcp://127.0.0.1:48403", "--status", f"http://{asked}"],
+    ]
+    log = (folder / "knowledge.log").open("w")
+    running = [subprocess.Popen(command, stdout=log, stderr=log) for command in commands]
+    find = lambda selector: judge.driver.find_elements(By.CSS_SELECTOR, selector)
+    try:
+        url = f"http://{address}/"
+        judge.wait("the page is served", lambda: served(judge, url))
+        judge.look("light", WIDE)
+        judge.open(url, "knowledge")
+        judge.wait("the questions are there", lambda: find("#question"))
+        if find("#file"):
+            judge.faults.append("a stranger has a form for files")
+        sign(judge, "otto")
+        if find("#file"):
+            judge.faults.append("an operator has a form for files")
+        judge.driver.find_element(By.ID, "sign").click()
+        sign(judge, "erna")
+        button = lambda name: next(one for one in find("main .button") if one.text == name)
+        judge.wait("the engineer has a form for files", lambda: find("#file"))[0].send_keys(str(bad))
+        button("Check").click()
+        judge.wait("the fault has its line", lambda: "cannot be loaded" in judge.text() and find("td.number")[0].text == "2")
+        judge.shoot("finding-light-wide")
+        judge.accessible("finding")
+        if button("Load").is_enabled():
+            judge.faults.append("a file with faults can be loaded")
+        find("#file")[0].send_keys(str(good))
+        button("Check").send_keys(Keys.ENTER)
+        judge.wait("the file can be loaded", lambda: button("Load").is_enabled())
+        button("Load").send_keys(Keys.ENTER)
+        judge.wait("the file is loaded", lambda: find(".badge") and find(".badge")[0].text == "loaded")
+        choose = Select(find("#question")[0]).select_by_visible_text
+        for scheme in ["light", "dark"]:
+            for size in [WIDE, PHONE]:
+                judge.look(scheme, size)
+                choose("Components, capabilities and skills as a graph")
+                find("#sparql")[0].send_keys(Keys.CONTROL, Keys.ENTER)
+                judge.wait("the graph is drawn", lambda: len(find(".graph-node")) >= 3)
+                name = f"knowledge-graph-{scheme}-{'phone' if size == PHONE else 'wide'}"
+                judge.shoot(name)
+                judge.overflow(name)
+                judge.accessible(name)
+        judge.look("light", WIDE)
+        choose("state-of")
+        judge.wait("the parameter has a field", lambda: find(".parameters input"))[0].send_keys("grasp", Keys.ENTER)
+        judge.wait("the question is answered", lambda: "skill_name" in judge.text(".result thead"))
+        judge.shoot("knowledge-question-light-wide")
+        judge.accessible("question")
+        judge.console()
+        judge.driver.get("about:blank")
+    finally:
+        for process in running:
+            process.send_signal(signal.SIGTERM)
+        for process in running:
+            process.wait(20)
+        log.close()
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--binaries", type=pathlib.Path, required=True)
@@ -368,6 +444,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         operate(judge, arguments.binaries, pathlib.Path(folder), arguments.examples)
         alarms(judge, arguments.binaries, pathlib.Path(folder))
+        knowledge(judge, arguments.binaries, pathlib.Path(folder))
     judge.driver.quit()
     print(json.dumps({"screenshots": str(arguments.out), "faults": judge.faults}, indent=2))
     sys.exit(bool(judge.faults))

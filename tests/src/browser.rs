@@ -69,6 +69,19 @@ impl Browser {
         self.exchange(&(self.head("POST", path, &more) + &body))
     }
 
+    /// Sends a file. `more` has further headers, each with its line end.
+    ///
+    /// # Panics
+    /// Panics if there is no answer.
+    #[must_use]
+    pub fn upload(&self, path: &str, more: &str, contents: &str) -> WebAnswer {
+        let more = format!(
+            "content-type: application/octet-stream\r\ncontent-length: {}\r\n{more}",
+            contents.len()
+        );
+        self.exchange(&(self.head("POST", path, &more) + contents))
+    }
+
     /// Opens a stream of events, as `view=values&count=20`.
     ///
     /// # Panics

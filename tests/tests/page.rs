@@ -209,9 +209,14 @@ fn browsers_that_never_read_cost_bounded_memory() {
 
 /// Adds a user of the server.
 fn add_user(cell: &Cell, name: &str, role: &str) {
+    add_user_in(&cell.folder().join("pki"), name, role);
+}
+
+/// Adds a user to a certificate store.
+fn add_user_in(pki: &Path, name: &str, role: &str) {
     let mut child = Command::new(program("ua-server"))
         .args(["user", "add", name, "--role", role, "--pki"])
-        .arg(cell.folder().join("pki"))
+        .arg(pki)
         .stdin(Stdio::piped())
         .stdout(Stdio::null())
         .spawn()
@@ -462,6 +467,97 @@ fn an_operator_starts_a_skill_and_others_are_refused() {
         "signed in on the page",
         "refused to sign in on the page",
         "called from the page",
+    ] {
+        assert!(log.contains(line), "{line}: {log}");
+    }
+}
+
+#[test]
+fn the_mes_is_queried_on_the_page_and_an_engineer_loads_a_file() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    add_user(&cell, "erna", "engineer");
+    add_user(&cell, "otto", "operator");
+    let text = "mes: mes\napplication_uri: urn:example:mes\nnamespace: 50\n\
+                endpoint: opc.tcp://127.0.0.1:48401\nsecurity: [None]\n";
+    let of_mes = cell.folder().join("mes-pki");
+    let _mes = Started::new("ua-mes", &program("ua-mes"))
+        .args([cell.file("mes.yaml", text).to_str().unwrap(), "--pki"])
+        .args([
+            of_mes.to_str().unwrap(),
+            "--interface",
+            "lo",
+            "--lds",
+            "none",
+        ])
+        .start();
+    let mapping = cell.file("page.yaml", "namespaces: {2: urn:ua-bridge:system-tests}\nvariables:\n  - {node: ns=2;i=30, name: setpoint, type: Double, origin: 0}\n");
+    let of_server = [
+        mapping.to_str().unwrap(),
+        "--status",
+        "http://127.0.0.1:8087",
+    ];
+    let server = cell.ua_server(&of_server);
+
+    let stranger = Browser::of(METRICS_SERVER);
+    let mut view = stranger.events("view=knowledge");
+    view.until("the MES is known", |view| {
+        (view["mes"] == true).then_some(())
+    });
+    let questions = stranger.get("/knowledge/questions").json();
+    let named = questions["questions"].as_array().unwrap().iter();
+    let nine = named.filter(|question| question["name"] == "state-of");
+    assert_eq!(nine.count(), 1, "{questions}");
+    let ask = |query: &str| stranger.post("/knowledge/query", &json!({ "query": query }));
+    let about = "SELECT ?p ?o { <urn:a> ?p ?o }";
+    assert_eq!(ask(about).json()["total"], 0);
+    let wrong = ask("SELECT {");
+    assert_eq!(wrong.code, 400, "{wrong:?}");
+    assert!(!wrong.json()["error"].as_str().unwrap().is_empty());
+
+    let file = "<urn:a> <urn:p> <urn:b> , 7 .";
+    let load = "/knowledge/load?name=a.ttl";
+    assert_eq!(stranger.upload(load, "", file).code, 401);
+    assert_eq!(signed_in("otto").upload(load, "", file).code, 403);
+    let erna = signed_in("erna");
+    let faulty = erna.upload(load, "", "<urn:a>\n<urn:p> .").json();
+    assert_eq!(
+        (&faulty["loaded"], &faulty["accepted"]),
+        (&json!(false), &json!(false))
+    );
+    assert_eq!(faulty["findings"][0]["line"], 2, "{faulty}");
+    let checked = erna.upload("/knowledge/check?name=a.ttl", "", file).json();
+    assert_eq!(checked["accepted"], true, "{checked}");
+    assert_eq!(ask(about).json()["total"], 0, "nothing is loaded yet");
+    assert_eq!(erna.upload(load, "", file).json()["loaded"], true);
+    assert_eq!(ask(about).json()["total"], 2);
+    let graph = ask("CONSTRUCT { ?s ?p ?o } WHERE { ?s <urn:p> ?o . ?s ?p ?o }").json();
+    assert_eq!(
+        (&graph["kind"], &graph["total"]),
+        (&json!("construct"), &json!(2))
+    );
+    assert_eq!(graph["rows"][0][0]["value"], "urn:a", "{graph}");
+
+    // Users of the MES decide once it has any.
+    add_user_in(&of_mes, "erna", "engineer");
+    let file = "<urn:a> <urn:p> 8 .";
+    assert_eq!(erna.upload(load, "", file).json()["needs_password"], true);
+    // wrong
+    let wrong = erna.upload(load, "x-mes-password: d3Jvbmc=\r\n", file);
+    assert_eq!(wrong.json()["needs_password"], true, "{wrong:?}");
+    // correct horse battery
+    let password = "x-mes-password: Y29ycmVjdCBob3JzZSBiYXR0ZXJ5\r\n";
+    let loaded = erna.upload(load, password, file).json();
+    assert_eq!(
+        (&loaded["loaded"], &loaded["replaces"]),
+        (&json!(true), &json!(true))
+    );
+    assert_eq!(ask(about).json()["total"], 1);
+    let log = server.lines().join("\n");
+    for line in [
+        "refused to load a source on the page",
+        "source sent from the page",
     ] {
         assert!(log.contains(line), "{line}: {log}");
     }

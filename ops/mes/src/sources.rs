@@ -5,7 +5,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use knowledge::{Knowledge, Lasting, Source, SourceFiles, SourceKind, nodeset};
+use knowledge::{
+    Knowledge, Lasting, Source, SourceCheck, SourceFiles, SourceFinding, SourceKind, nodeset,
+};
 use mtp::{Module, Triple, escaped};
 use rml::{Folder, Mapping};
 use serde::Serialize;
@@ -370,6 +372,29 @@ impl SourceFiles for Sources {
         Ok(is_new)
     }
 
+    fn check(&self, kind: SourceKind, name: &str, contents: &[u8]) -> SourceCheck {
+        let mut source = Source::new(kind, name);
+        let read = examined(&mut source, contents).and_then(|notes| {
+            self.of_yaml(&source).map_err(|why| vec![why])?;
+            Ok(notes)
+        });
+        let accepted = read.is_ok();
+        let whats = read.unwrap_or_else(|faults| faults);
+        let findings = whats.into_iter().map(|what| {
+            let found = finding(&source, what, !accepted);
+            SourceFinding {
+                line: found.line,
+                what: found.what,
+                refused: found.refused,
+            }
+        });
+        SourceCheck {
+            accepted,
+            replaces: accepted && self.is_known(&source),
+            findings: findings.collect(),
+        }
+    }
+
     fn remove(&self, kind: SourceKind, name: &str) -> Result<bool, String> {
         let source = Source::new(kind, name);
         self.of_yaml(&source)?;
@@ -387,6 +412,52 @@ impl SourceFiles for Sources {
             "sources": self.knowledge.sources(),
             "findings": self.findings(),
         })
+    }
+}
+
+/// Reads the contents of a source without adding it, and names it as it would be added. Returns its
+/// notes.
+///
+/// # Errors
+/// The faults because of which it cannot be added.
+fn examined(source: &mut Source, contents: &[u8]) -> Result<Vec<String>, Vec<String>> {
+    let one = |what: String| vec![what];
+    match source.kind {
+        SourceKind::NodeSet => {
+            let text = decoded(contents).map_err(one)?;
+            source.name = node_set(&text).map_err(one)?.namespace;
+            Ok(Vec::new())
+        }
+        SourceKind::Mtp => {
+            // A manifest that was sent has no folder.
+            let read = Module::from_files(contents, &mut |_: &str| None);
+            let module = read.map_err(|fault| one(fault.to_string()))?;
+            Ok(module.findings.iter().map(ToString::to_string).collect())
+        }
+        SourceKind::File | SourceKind::Process => {
+            let recipe = if source.kind == SourceKind::Process {
+                recipe::in_source(contents).map_err(one)?
+            } else {
+                None
+            };
+            if let Some((text, names)) = recipe {
+                let all = |found: Vec<recipe::Finding>| -> Vec<String> {
+                    found.iter().map(ToString::to_string).collect()
+                };
+                return recipe::read(&text, &names)
+                    .map(|recipe| all(recipe.notes))
+                    .map_err(all);
+            }
+            let text = utf8(contents).map_err(one)?;
+            let read = Knowledge::check_turtle(&text);
+            read.map_err(|fault| one(fault.to_string()))?;
+            Ok(Vec::new())
+        }
+        kind @ (SourceKind::Component
+        | SourceKind::Run
+        | SourceKind::State
+        | SourceKind::Graph
+        | SourceKind::Derived) => Err(one(format!("a {kind} is not read from a file"))),
     }
 }
 
@@ -473,5 +544,39 @@ mod tests {
         let place =
             "parts.rml.ttl: triples map <urn:example:parts:Parts>: source `parts.xml`: line 1";
         assert!(found.what.contains(place), "{}", found.what);
+    }
+
+    #[test]
+    fn a_check_has_the_lines_of_the_findings_and_changes_nothing() {
+        let knowledge = Arc::new(Knowledge::new().unwrap());
+        let sources = Sources::new(Arc::clone(&knowledge));
+        let before = *knowledge.changes().borrow();
+        let check = |kind, contents: &[u8]| sources.check(kind, "a", contents);
+        let good = check(SourceKind::File, b"<urn:a> <urn:p> 1 .");
+        assert_eq!(
+            (good.accepted, good.replaces, good.findings.len()),
+            (true, false, 0)
+        );
+        for (kind, contents, line) in [
+            (SourceKind::File, &b"<urn:a>\n<urn:p> ."[..], Some(2)),
+            (SourceKind::File, &b"<urn:a> <urn:p> 1 .\n\xff"[..], Some(2)),
+            (SourceKind::NodeSet, &b"<UANodeSet>\n</other>"[..], None),
+            (SourceKind::Mtp, &b"<CAEXFile>"[..], None),
+            (SourceKind::Run, &b""[..], None),
+        ] {
+            let bad = check(kind, contents);
+            let [found] = bad.findings.as_slice() else {
+                panic!("{bad:?}")
+            };
+            assert!(!bad.accepted && found.refused, "{bad:?}");
+            assert!(line.is_none() || found.line == line, "{bad:?}");
+        }
+        assert_eq!(*knowledge.changes().borrow(), before);
+        SourceFiles::put(&sources, SourceKind::File, "a", b"<urn:a> <urn:p> 1 .").unwrap();
+        assert!(check(SourceKind::File, b"<urn:a> <urn:p> 2 .").replaces);
+        let manifest = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/mtp/stage.aml");
+        let manifest = check(SourceKind::Mtp, &std::fs::read(manifest).unwrap());
+        assert!(manifest.accepted, "{manifest:?}");
+        assert!(manifest.findings.iter().all(|found| found.line.is_some()));
     }
 }

@@ -8,10 +8,11 @@ import * as topic from "/topic.js";
 import * as map from "/map.js";
 import * as skills from "/skills.js";
 import * as processes from "/processes.js";
+import * as knowledge from "/knowledge.js";
 import * as events from "/events.js";
 import * as alarms from "/alarms.js";
 
-const VIEWS = { programs, values, topic, map, skills, processes, events, alarms };
+const VIEWS = { programs, values, topic, map, skills, processes, knowledge, events, alarms };
 const QUIET_MS = 12000;
 
 const main = document.getElementById("main");

@@ -7,11 +7,14 @@ const SEVERITY = { running: "run", done: "good", failed: "bad", lost: "bad", sto
 export function show(root) {
   const summary = h("p", { class: "summary", role: "status" });
   const body = h("div", { class: "runs" });
-  root.append(h("div", { class: "head" }, h("h1", { text: "Processes" }), summary), body);
+  // Drawn apart from the runs, so that the focus stays on its buttons.
+  const known = h("div", { class: "known" });
+  root.append(h("div", { class: "head" }, h("h1", { text: "Processes" }), summary), body, known);
   let last = null;
   const draw = () => {
     if (!last) return;
     if (!last.mes) {
+      render(known, "none", () => []);
       render(body, "none", () => [empty("No MES", "Name the address of ua-mes with --status URL: the address of its --sparql, http://127.0.0.1:8087 by default.")]);
       return;
     }
@@ -19,11 +22,13 @@ export function show(root) {
     const active = runs.some((run) => run.outcome === "running");
     const text = `${several(last.processes.length, "process", "processes")} · ${several(runs.length, "run")}`;
     render(summary, text, () => [text]);
-    render(body, [last, active ? Math.floor(Date.now() / 1000) : 0], () => [
-      ...runs.map(strip),
-      h("section", { class: "card" }, h("h2", { text: "Known processes" }), h("ul", { class: "plain" }, last.processes.map((process) => h("li", {},
-        h("strong", { text: process.name || process.process }), " ", h("span", { class: "muted", text: process.steps.join(" → ") }))))),
-    ]);
+    render(body, [last.runs, active ? Math.floor(Date.now() / 1000) : 0], () => runs.map(strip));
+    render(known, last.processes, () => [h("section", { class: "card" }, h("h2", { text: "Known processes" }), h("ul", { class: "plain" }, last.processes.map((process) => {
+      const name = process.name || process.process;
+      return h("li", { class: "call" },
+        h("div", { class: "grow" }, h("strong", { text: name }), " ", h("span", { class: "muted", text: process.steps.join(" → ") })),
+        h("button", { type: "button", class: "button quiet", text: "Choices", "aria-label": `Choices of ${name}`, onclick: () => choices(name, process.process) }));
+    })))]);
   };
   return { title: "Processes", query: () => "view=processes", update(data) { last = data; draw(); }, tick: draw };
 }
@@ -52,4 +57,37 @@ function strip(run) {
         s("title", { text: [step.step, step.component, step.outcome, step.reason].filter(Boolean).join("\n") }),
         s("text", { class: "step", x: 0, y: 37 + at * 24, text: name(step) }),
         s("rect", { class: "step-bar", x: x(step.started_ms), y: 24 + at * 24, rx: 3, height: 17, width: Math.max(3, x(step.ended_ms ?? end) - x(step.started_ms)) }))))) : null);
+}
+
+/** Shows the skills that each step would be done by now, with the reason for each choice. */
+async function choices(name, process) {
+  const body = h("div", { class: "choices", text: "…" });
+  const dialog = h("dialog", { class: "wide", "aria-labelledby": "choices-title" }, h("div", { class: "form" },
+    h("h2", { id: "choices-title", text: `${name}: choices at present` }), body,
+    h("div", { class: "actions" }, h("button", { type: "button", class: "button", text: "Close", onclick: () => dialog.close() }))));
+  dialog.addEventListener("close", () => dialog.remove());
+  document.body.append(dialog);
+  dialog.showModal();
+  try {
+    const response = await fetch(`/knowledge/plan?process=${encodeURIComponent(process)}`);
+    const told = await response.json();
+    if (!response.ok) throw new Error(told.error);
+    body.replaceChildren(...planned(told));
+  } catch (error) {
+    body.replaceChildren(h("p", { class: "fault", role: "alert", text: error.message }));
+  }
+}
+
+/** Returns the steps of a plan with their candidates. */
+function planned(told) {
+  const rows = told.plan.steps.flatMap((step) => step.needs.flatMap((need) => need.candidates.length
+    ? need.candidates.map((one) => ({ step: step.step, who: `${one.component_name} · ${one.name}`, why: one.why, chosen: one.chosen }))
+    : [{ step: step.step, who: "no candidate", why: need.capability ?? need.type ?? "", chosen: false }]));
+  return [
+    told.complete ? badge("good", "complete") : badge("bad", "incomplete"),
+    h("div", { class: "table-frame", tabindex: 0, role: "region", "aria-label": "Choices" }, h("table", { class: "result" },
+      h("thead", {}, h("tr", {}, ["Step", "Skill", "Choice", "Reason"].map((text) => h("th", { scope: "col", text })))),
+      h("tbody", {}, rows.map((row) => h("tr", {}, h("td", { text: row.step }), h("td", { text: row.who }),
+        h("td", {}, row.chosen ? badge("good", "chosen") : "–"), h("td", { text: row.why })))))),
+  ];
 }

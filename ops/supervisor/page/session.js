@@ -8,6 +8,7 @@ export const session = {
   roles: "",
   csrf: "",
   mayOperate: false,
+  mayLoad: false,
   maySignIn: false,
   mustSignIn: false,
   pending: new Set(),
@@ -24,6 +25,7 @@ export const session = {
     this.roles = told.roles ?? "";
     this.csrf = told.csrf ?? "";
     this.mayOperate = Boolean(told.may_operate);
+    this.mayLoad = Boolean(told.may_load);
     this.maySignIn = Boolean(told.may_sign_in);
     this.mustSignIn = Boolean(told.must_sign_in);
     const user = document.getElementById("user");
@@ -39,14 +41,18 @@ export const session = {
    */
   async post(path, body) {
     const text = JSON.stringify(body);
-    const sent = `${path} ${text}`;
+    return this.send(path, text, { "content-type": "application/json" }, `${path} ${text}`);
+  },
+
+  /** Sends a body of another type, such as a file. `sent` names the request. */
+  async send(path, body, headers, sent) {
     if (this.pending.has(sent)) throw new Error("already sent: its outcome is awaited");
     this.pending.add(sent);
     try {
       const response = await fetch(path, {
         method: "POST",
-        headers: { "content-type": "application/json", "x-csrf-token": this.csrf },
-        body: text,
+        headers: { ...headers, "x-csrf-token": this.csrf },
+        body,
       }).catch(() => {
         throw new Error("the connection is lost: the outcome is unknown");
       });

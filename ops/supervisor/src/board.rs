@@ -13,6 +13,7 @@ use mappings::{Mapping, NodeIdText, SpaceId, TopicId, Variable};
 use uadp::Timestamp;
 
 use crate::announced::Description;
+use crate::mes::Mes;
 use crate::operations::ConditionState;
 use crate::program::Program;
 use crate::timeline::{Call, Timeline};
@@ -231,6 +232,13 @@ impl Board {
     /// Removes a call.
     pub(crate) fn withdraw(&mut self, topic: TopicId) {
         self.calls.remove(&topic);
+    }
+
+    /// Returns the MES, if its status was read.
+    pub(crate) fn mes(&self) -> Option<Mes> {
+        let is_mes = |program: &&Program| program.status.as_ref().is_ok_and(Mes::is_status);
+        let program = self.programs.iter().find(is_mes)?;
+        program.source.parse().ok().map(Mes::new)
     }
 
     /// Takes the status of all programs.

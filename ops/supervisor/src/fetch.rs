@@ -5,9 +5,11 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_client::header::HOST;
-use http_client::{Connection, Request};
+use http_client::header::{HOST, HeaderValue, InvalidHeaderValue};
+use http_client::{Connection, HttpError, Request, Response};
+use hyper::Uri;
 use serde_json::Value;
+use thiserror::Error;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
@@ -53,34 +55,63 @@ impl fmt::Display for StatusUrl {
     }
 }
 
+/// The reason why a request to a program has no response.
+#[derive(Debug, Error)]
+pub(crate) enum FetchFault {
+    /// The program was not reached.
+    #[error("no connection: {0}")]
+    Connection(#[source] std::io::Error),
+    /// The response is late. The request may have been executed.
+    #[error("no response within {} s", .0.as_secs())]
+    Late(Duration),
+    /// The response is no HTTP, or its body is too large. The request may have been executed.
+    #[error(transparent)]
+    Exchange(#[from] HttpError),
+    /// The request has a value that no header holds.
+    #[error("the request cannot be made: {0}")]
+    Header(#[from] InvalidHeaderValue),
+}
+
 impl StatusUrl {
     /// Reads the status.
     pub(crate) async fn fetch(&self) -> Result<Value, String> {
-        match timeout(LIMIT, self.request()).await {
-            Ok(answer) => answer,
-            Err(_) => Err(format!("no response within {} s", LIMIT.as_secs())),
-        }
-    }
-
-    async fn request(&self) -> Result<Value, String> {
-        let stream = TcpStream::connect(&self.authority)
-            .await
-            .map_err(|error| format!("no connection: {error}"))?;
-        let request = Request::get("/status")
-            .header(HOST, &self.authority)
-            .body(Bytes::new())
-            .map_err(text)?;
-        let connection = Connection::open(stream).await.map_err(text)?;
-        let response = connection.send(request, MOST_BYTES).await.map_err(text)?;
+        let mut request = Request::new(Bytes::new());
+        *request.uri_mut() = Uri::from_static("/status");
+        let response = self.send(request, (MOST_BYTES, LIMIT)).await;
+        let response = response.map_err(|fault| fault.to_string())?;
         if !response.status().is_success() {
             return Err(format!("the response is {}", response.status()));
         }
         serde_json::from_slice(response.body()).map_err(|error| format!("no status: {error}"))
     }
-}
 
-fn text(error: impl fmt::Display) -> String {
-    error.to_string()
+    /// Sends a request to the program. Returns the response, whose body has at most `most` bytes.
+    ///
+    /// # Errors
+    /// [`FetchFault`].
+    pub(crate) async fn send(
+        &self,
+        mut request: Request<Bytes>,
+        (most, limit): (usize, Duration),
+    ) -> Result<Response<Bytes>, FetchFault> {
+        let host = HeaderValue::from_str(&self.authority)?;
+        request.headers_mut().insert(HOST, host);
+        let exchange = async {
+            let stream = TcpStream::connect(&self.authority).await;
+            let stream = stream.map_err(FetchFault::Connection)?;
+            let connection = Connection::open(stream).await?;
+            Ok(connection.send(request, most).await?)
+        };
+        match timeout(limit, exchange).await {
+            Ok(answer) => answer,
+            Err(_) => Err(FetchFault::Late(limit)),
+        }
+    }
+
+    /// Returns the host with its port.
+    pub(crate) fn authority(&self) -> &str {
+        &self.authority
+    }
 }
 
 const LIMIT: Duration = Duration::from_secs(2);

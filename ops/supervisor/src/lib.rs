@@ -8,12 +8,14 @@
 //! `program` (rows of programs), `skill` (tiles of skills), `timeline` (events), `view` (what a
 //! browser is sent), `stream` (server-sent events), `fetch` (the status of other programs), `page`
 //! (state and events), `session` (signed-in users), `encode` (forms), `operations` (commands),
-//! `proxy`, `tls`, `responses` and `site` (requests).
+//! `mes` and `table` (the knowledge of the plant), `proxy`, `tls`, `responses` and `site`
+//! (requests).
 
 mod announced;
 mod board;
 mod encode;
 mod fetch;
+mod mes;
 mod operations;
 mod page;
 mod program;
@@ -23,12 +25,14 @@ mod session;
 mod site;
 mod skill;
 mod stream;
+mod table;
 mod timeline;
 mod tls;
 mod value;
 mod view;
 
 pub use fetch::{StatusUrl, StatusUrlError};
+pub use mes::source_kind;
 pub use operations::{
     ConditionAction, ConditionChange, ConditionState, MOST_CONDITIONS, OperationFault, Operations,
 };

@@ -20,6 +20,9 @@ pub trait Operations: Send + Sync + 'static {
     /// Returns whether the roles of a user include the operation of machines.
     fn may_operate(&self, user: &str) -> bool;
 
+    /// Returns whether the roles of a user include the sources of the knowledge of the plant.
+    fn may_load(&self, user: &str) -> bool;
+
     /// Sends a request for a call on behalf of a user, and returns the fields of the response.
     fn call(
         &self,

@@ -17,6 +17,7 @@ use uadp::{NetworkMessage, PublisherId, SecurityHeader, Timestamp};
 use crate::announced::{self, Description};
 use crate::board::{At, Board, Sample};
 use crate::fetch::StatusUrl;
+use crate::mes::{Mes, Places};
 use crate::operations::Operations;
 use crate::program::Program;
 use crate::proxy::ProxyUrl;
@@ -37,6 +38,8 @@ pub struct Page {
     /// The users and the commands of the program, if it has any.
     pub(crate) operations: OnceLock<Arc<dyn Operations>>,
     pub(crate) sessions: Mutex<Sessions>,
+    /// The requests to the MES at the same time.
+    pub(crate) places: Places,
     board: Mutex<Board>,
     /// Whether the page shows a recording instead of the group.
     shows_recording: AtomicBool,
@@ -73,6 +76,7 @@ impl Page {
             tls: OnceLock::new(),
             operations: OnceLock::new(),
             sessions: Mutex::default(),
+            places: Places::default(),
             board: Mutex::default(),
             shows_recording: AtomicBool::new(false),
             started: now().monotonic,
@@ -163,6 +167,24 @@ impl Page {
             since: now.monotonic.saturating_duration_since(self.started),
             utc: now.utc,
         }
+    }
+
+    /// Returns the MES among the programs whose status is read.
+    pub(crate) async fn mes(&self) -> Option<Mes> {
+        let known = self.board().mes();
+        if known.is_some() {
+            return known;
+        }
+        for url in &self.others {
+            if url
+                .fetch()
+                .await
+                .is_ok_and(|status| Mes::is_status(&status))
+            {
+                return Some(Mes::new(url.clone()));
+            }
+        }
+        None
     }
 
     /// Counts a browser.

@@ -15,6 +15,16 @@ pub(crate) fn set_cookie(response: &mut Response<PageBody>, cookie: &str) {
     }
 }
 
+/// The status and the reason of a refused request.
+#[derive(Debug)]
+pub(crate) struct Refusal(pub(crate) StatusCode, pub(crate) String);
+
+impl Refusal {
+    pub(crate) fn new(status: StatusCode, why: impl Into<String>) -> Self {
+        Self(status, why.into())
+    }
+}
+
 pub(crate) fn refused(status: StatusCode, why: &str) -> Response<PageBody> {
     let mut response = json_page(&json!({ "error": why }));
     *response.status_mut() = status;
@@ -55,7 +65,7 @@ const HEADERS: [(HeaderName, &str); 6] = [
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
 /// The files of the page by their paths.
-pub(crate) const FILES: [(&str, &str, &str); 14] = [
+pub(crate) const FILES: [(&str, &str, &str); 16] = [
     (
         "/",
         "text/html; charset=utf-8",
@@ -86,6 +96,12 @@ pub(crate) const FILES: [(&str, &str, &str); 14] = [
         SCRIPT,
         include_str!("../page/processes.js"),
     ),
+    (
+        "/knowledge.js",
+        SCRIPT,
+        include_str!("../page/knowledge.js"),
+    ),
+    ("/graph.js", SCRIPT, include_str!("../page/graph.js")),
 ];
 
 #[cfg(test)]

@@ -1,14 +1,18 @@
 //! The requests of browsers.
 
+mod knowledge;
+
+use std::error::Error;
 use std::fs::File;
 use std::io::Read as _;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
+use std::time::Duration;
 
 use bridge_node::{BoxFuture, PageBody, Site, Statuses, Visit, full};
 use bytes::Bytes;
 use http_body_util::{BodyExt as _, Limited};
-use hyper::body::Incoming;
+use hyper::body::{Body, Incoming};
 use hyper::header::{
     ALLOW, CONTENT_TYPE, COOKIE, HOST, HeaderMap, HeaderName, HeaderValue, ORIGIN,
 };
@@ -22,7 +26,7 @@ use tracing::{info, warn};
 use crate::encode;
 use crate::operations::{ConditionChange, OperationFault, Operations};
 use crate::page::Page;
-use crate::responses::{FILES, json_page, refused, set_cookie, with_headers};
+use crate::responses::{FILES, Refusal, json_page, refused, set_cookie, with_headers};
 use crate::session::{Reader, Session, cookie};
 use crate::stream::Events;
 use crate::value;
@@ -115,26 +119,34 @@ impl Site for Page {
     }
 }
 
-/// The status and the reason of a refused request.
-struct Refusal(StatusCode, String);
+/// The body of a request.
+pub(crate) trait RequestBody:
+    Body<Data: Send, Error: Into<Box<dyn Error + Send + Sync>>> + Send + 'static
+{
+}
 
-impl Refusal {
-    fn new(status: StatusCode, why: impl Into<String>) -> Self {
-        Self(status, why.into())
-    }
+impl<B> RequestBody for B where
+    B: Body<Data: Send, Error: Into<Box<dyn Error + Send + Sync>>> + Send + 'static
+{
 }
 
 impl Page {
     async fn respond(
         self: Arc<Self>,
-        request: Request<Incoming>,
+        request: Request<impl RequestBody>,
         visit: &Visit,
     ) -> Result<Response<PageBody>, Refusal> {
         let (host, via) = self.host(request.headers(), visit)?;
         let path = request.uri().path().to_owned();
         if request.method() == Method::POST {
-            check_origin(request.headers(), &self.origin(&host, via))?;
+            let media = knowledge::media(&path).unwrap_or(JSON);
+            check_origin(request.headers(), &self.origin(&host, via), media)?;
             let browser = self.browser(request.headers(), (host, via));
+            if path == knowledge::QUERY {
+                check_reader(&browser)?;
+                visit.keep_open();
+                return knowledge::query(&self, body(request).await?).await;
+            }
             return self.change(&path, request, browser, visit).await;
         }
         if request.method() != Method::GET {
@@ -166,6 +178,11 @@ impl Page {
                 let events = Events::start(worker, Arc::clone(&self), view, reader);
                 Ok(with_headers("text/event-stream", events.boxed_unsync()))
             }
+            knowledge::QUESTIONS | knowledge::PLAN => {
+                check_reader(&browser)?;
+                visit.keep_open();
+                knowledge::read(&self, request.uri()).await
+            }
             _ => Err(Refusal::new(
                 StatusCode::NOT_FOUND,
                 "there is no such page; the start is /",
@@ -177,7 +194,7 @@ impl Page {
     async fn change(
         self: Arc<Self>,
         path: &str,
-        request: Request<Incoming>,
+        request: Request<impl RequestBody>,
         browser: Browser,
         visit: &Visit,
     ) -> Result<Response<PageBody>, Refusal> {
@@ -224,6 +241,9 @@ impl Page {
             "/condition" => {
                 let change: ConditionChange = body(request).await?;
                 change_condition(operations.as_ref(), session, &change)
+            }
+            knowledge::CHECK | knowledge::LOAD => {
+                knowledge::upload(&self, operations.as_ref(), session, request).await
             }
             _ => Err(Refusal::new(
                 StatusCode::NOT_FOUND,
@@ -339,15 +359,17 @@ impl Page {
             let roles = operations?.roles(&session.user)?;
             Some((session, roles))
         });
-        let may_operate = user.as_ref().is_some_and(|(session, _)| {
-            operations.is_some_and(|operations| operations.may_operate(&session.user))
-        });
+        let may = |right: fn(&dyn Operations, &str) -> bool| {
+            let user = user.as_ref().zip(operations);
+            user.is_some_and(|((session, _), operations)| right(operations.as_ref(), &session.user))
+        };
         json!({
             "program": self.program,
             "version": build_info::version(),
             "may_sign_in": may_sign_in,
             "must_sign_in": via.is_remote() && user.is_none(),
-            "may_operate": may_operate,
+            "may_operate": may(Operations::may_operate),
+            "may_load": may(Operations::may_load),
             "user": user.as_ref().map(|(session, _)| &session.user),
             "roles": user.as_ref().map(|(_, roles)| roles),
             "csrf": user.as_ref().map(|(session, _)| &session.csrf),
@@ -532,7 +554,8 @@ fn refusal(fault: OperationFault, user: &str) -> Refusal {
 }
 
 /// Refuses requests that the page of another site has sent. `own` is the origin of the page.
-fn check_origin(headers: &HeaderMap, own: &str) -> Result<(), Refusal> {
+/// `media` is the media type that only scripts of the page itself send.
+fn check_origin(headers: &HeaderMap, own: &str, media: &str) -> Result<(), Refusal> {
     let text = |name| {
         headers
             .get(name)
@@ -541,36 +564,39 @@ fn check_origin(headers: &HeaderMap, own: &str) -> Result<(), Refusal> {
     let site = text(HeaderName::from_static("sec-fetch-site"));
     let origin = text(ORIGIN);
     let is_own = origin.is_none_or(|origin| origin == own);
-    let is_json = text(CONTENT_TYPE).is_some_and(|media| media.starts_with("application/json"));
-    if site.is_some_and(|site| site != "same-origin") || !is_own || !is_json {
-        return Err(Refusal::new(
-            StatusCode::FORBIDDEN,
-            "only the page itself may send this, as application/json",
-        ));
+    let is_media = text(CONTENT_TYPE).is_some_and(|sent| sent.starts_with(media));
+    if site.is_some_and(|site| site != "same-origin") || !is_own || !is_media {
+        let why = format!("only the page itself may send this, as {media}");
+        return Err(Refusal::new(StatusCode::FORBIDDEN, why));
     }
     Ok(())
 }
 
-async fn body<T: for<'d> Deserialize<'d>>(request: Request<Incoming>) -> Result<T, Refusal> {
-    let limited = Limited::new(request.into_body(), LARGEST_BODY);
-    let collected = tokio::time::timeout(BODY_TIME, limited.collect()).await;
-    let bytes: Bytes = match collected {
-        Ok(Ok(body)) => body.to_bytes(),
-        Ok(Err(error)) => {
-            return Err(Refusal::new(
-                StatusCode::PAYLOAD_TOO_LARGE,
-                error.to_string(),
-            ));
-        }
-        Err(_) => {
-            return Err(Refusal::new(
-                StatusCode::REQUEST_TIMEOUT,
-                "the request has not arrived",
-            ));
-        }
-    };
+async fn body<T: for<'d> Deserialize<'d>>(
+    request: Request<impl RequestBody>,
+) -> Result<T, Refusal> {
+    let bytes = bytes(request, (LARGEST_BODY, BODY_TIME)).await?;
     serde_json::from_slice(&bytes)
         .map_err(|error| Refusal::new(StatusCode::BAD_REQUEST, error.to_string()))
+}
+
+/// Returns the body of a request, if it has at most `most` bytes and arrives in time.
+async fn bytes(
+    request: Request<impl RequestBody>,
+    (most, limit): (usize, Duration),
+) -> Result<Bytes, Refusal> {
+    let limited = Limited::new(request.into_body(), most);
+    match tokio::time::timeout(limit, limited.collect()).await {
+        Ok(Ok(body)) => Ok(body.to_bytes()),
+        Ok(Err(error)) => Err(Refusal::new(
+            StatusCode::PAYLOAD_TOO_LARGE,
+            error.to_string(),
+        )),
+        Err(_) => Err(Refusal::new(
+            StatusCode::REQUEST_TIMEOUT,
+            "the request has not arrived",
+        )),
+    }
 }
 
 /// Returns the name or address in a Host header.
@@ -601,130 +627,8 @@ fn random() -> std::io::Result<String> {
 const FORWARDED: [&str; 4] = ["forwarded", "x-forwarded-for", "x-real-ip", "via"];
 const RANDOM: &str = "/dev/urandom";
 const LARGEST_BODY: usize = 64 << 10;
-const BODY_TIME: std::time::Duration = std::time::Duration::from_secs(5);
+const BODY_TIME: Duration = Duration::from_secs(5);
+const JSON: &str = "application/json";
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn headers(pairs: &[(&'static str, &'static str)]) -> HeaderMap {
-        let pairs = pairs.iter();
-        pairs
-            .map(|(name, value)| {
-                (
-                    HeaderName::from_static(name),
-                    HeaderValue::from_static(value),
-                )
-            })
-            .collect()
-    }
-
-    fn is_from_page(pairs: &[(&'static str, &'static str)]) -> bool {
-        check_origin(&headers(pairs), "http://localhost:9100").is_ok()
-    }
-
-    #[test]
-    fn only_names_of_loopback_are_answered() {
-        for host in [
-            "localhost",
-            "localhost:80",
-            "127.0.0.1:9100",
-            "[::1]:9100",
-            "127.9.9.9",
-        ] {
-            assert!(is_loopback_name(host), "{host}");
-        }
-        for host in [
-            "evil.example",
-            "localhost.evil.example:80",
-            "10.0.0.1",
-            "",
-            "0.0.0.0",
-        ] {
-            assert!(!is_loopback_name(host), "{host}");
-        }
-    }
-
-    #[test]
-    fn a_request_from_another_site_is_refused() {
-        const JSON: (&str, &str) = ("content-type", "application/json");
-        assert!(is_from_page(&[JSON]));
-        assert!(is_from_page(&[
-            JSON,
-            ("origin", "http://localhost:9100"),
-            ("sec-fetch-site", "same-origin")
-        ]));
-        assert!(!is_from_page(&[JSON, ("origin", "http://evil.example")]));
-        assert!(!is_from_page(&[JSON, ("origin", "null")]));
-        assert!(!is_from_page(&[JSON, ("sec-fetch-site", "same-site")]));
-        assert!(!is_from_page(&[("content-type", "text/plain")]));
-        assert!(!is_from_page(&[]));
-        for (origin, is_own) in [
-            ("https://cell.example", true),
-            ("https://evil.example", false),
-        ] {
-            let sent = headers(&[JSON, ("origin", origin)]);
-            assert_eq!(check_origin(&sent, "https://cell.example").is_ok(), is_own);
-        }
-    }
-
-    fn visit(peer: &str, is_secure: bool) -> Visit {
-        let mut visit = Visit::from(peer.parse::<SocketAddr>().unwrap());
-        visit.is_secure = is_secure;
-        visit
-    }
-
-    #[test]
-    fn behind_a_proxy_users_sign_in_and_cookies_are_secure() {
-        let here = visit("127.0.0.1:5000", false);
-        let proxied = Page::new(
-            "test",
-            Vec::new(),
-            Some("https://cell.example".parse().unwrap()),
-        );
-        let open = Page::new("test", Vec::new(), None);
-        let of_proxy = headers(&[("host", "cell.example")]);
-        assert!(open.host(&of_proxy, &here).is_err());
-        let of_loopback = headers(&[("host", "localhost:9100")]);
-        let there = visit("10.0.0.1:1", false);
-        assert!(open.host(&of_loopback, &there).is_err());
-        let forwarded = headers(&[("host", "127.0.0.1:9100"), ("x-forwarded-for", "10.0.0.1")]);
-        assert!(open.host(&forwarded, &here).is_err());
-        // A proxy may pass on the name of loopback, and another Host.
-        for sent in [&of_proxy, &forwarded] {
-            let (host, via) = proxied.host(sent, &here).ok().unwrap();
-            assert_eq!(proxied.origin(&host, via), "https://cell.example");
-            let browser = proxied.browser(&HeaderMap::new(), (host, via));
-            assert!(check_reader(&browser).is_err());
-            let cookie = browser.cookie("ab", 60);
-            assert!(cookie.starts_with("__Host-ua-session=ab; Path=/;"));
-            assert!(cookie.ends_with("; Secure"));
-        }
-        let of_loopback = headers(&[("host", "127.0.0.1:9100")]);
-        let found = open.host(&of_loopback, &here).ok().unwrap();
-        assert_eq!(open.origin(&found.0, found.1), "http://127.0.0.1:9100");
-        let browser = open.browser(&HeaderMap::new(), found);
-        assert!(check_reader(&browser).is_ok());
-        let cookie = browser.cookie("ab", 60);
-        assert!(cookie.starts_with("ua-session-9100=ab; Path=/;"));
-        assert!(cookie.contains("HttpOnly; SameSite=Strict") && !cookie.contains("Secure"));
-    }
-
-    #[test]
-    fn by_tls_users_of_other_hosts_sign_in_and_other_names_are_refused() {
-        let page = Page::new("test", Vec::new(), None);
-        let there = visit("10.0.0.1:5000", true);
-        let of_address = headers(&[("host", "10.0.0.2:9443")]);
-        let found = page.host(&of_address, &there).ok().unwrap();
-        assert_eq!(page.origin(&found.0, found.1), "https://10.0.0.2:9443");
-        let browser = page.browser(&HeaderMap::new(), found);
-        assert!(check_reader(&browser).is_err());
-        assert!(browser.cookie("ab", 60).ends_with("; Secure"));
-        let told = page.told(None, browser.via);
-        assert_eq!(told["must_sign_in"], true);
-        for other in ["evil.example", "", "localhost.evil.example"] {
-            let sent = headers(&[("host", other)]);
-            assert!(page.host(&sent, &there).is_err(), "{other}");
-        }
-    }
-}
+mod tests;

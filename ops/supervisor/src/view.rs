@@ -7,6 +7,7 @@ use mappings::{SpaceId, TopicId};
 use serde_json::{Map, Value, json};
 
 use crate::board::{Board, Entry, quality};
+use crate::mes::Mes;
 use crate::operations;
 use crate::skill;
 use crate::value;
@@ -26,6 +27,8 @@ pub(crate) enum View {
     Skills,
     /// The processes of the MES.
     Processes,
+    /// The knowledge of the MES, which the browser requests itself.
+    Knowledge,
     /// The conditions of the server.
     Alarms,
     /// The events of values and calls over time.
@@ -90,12 +93,13 @@ impl View {
             "map" => Self::Map,
             "skills" => Self::Skills,
             "processes" => Self::Processes,
+            "knowledge" => Self::Knowledge,
             "alarms" => Self::Alarms,
             "events" => Self::Events,
             other => {
                 return Err(format!(
                     "view={other}: there are programs, values, topic, map, skills, processes, \
-                     alarms and events"
+                     knowledge, alarms and events"
                 ));
             }
         })
@@ -104,7 +108,9 @@ impl View {
     /// Returns the period of events.
     pub(crate) const fn period(&self) -> Duration {
         match self {
-            Self::Programs | Self::Map | Self::Processes => Duration::from_secs(1),
+            Self::Programs | Self::Map | Self::Processes | Self::Knowledge => {
+                Duration::from_secs(1)
+            }
             Self::Values(_) | Self::Topic(_) | Self::Skills | Self::Alarms | Self::Events => {
                 Duration::from_millis(250)
             }
@@ -148,6 +154,11 @@ impl Viewer {
                 self.changed(shown)
             }
             View::Processes => self.changed(processes(board)),
+            View::Knowledge => {
+                // The state is known when the programs were read for the first time.
+                let is_known = !board.programs.is_empty();
+                self.changed(json!({ "mes": is_known.then(|| board.mes().is_some()) }))
+            }
             View::Events => {
                 let names = board.event_names();
                 let text = names.to_string();
@@ -495,7 +506,7 @@ fn map(board: &mut Board, now: Duration) -> Value {
 fn processes(board: &Board) -> Value {
     let mes = board.programs.iter().find_map(|program| {
         let status = program.status.as_ref().ok()?;
-        status.get("processes").is_some().then_some(status)
+        Mes::is_status(status).then_some(status)
     });
     match mes {
         None => json!({ "mes": false }),

@@ -70,6 +70,13 @@ impl Operations for PageOperations {
             .is_some_and(|roles| roles.meets(runs))
     }
 
+    fn may_load(&self, user: &str) -> bool {
+        let loads = Roles::of(&[Role::Engineer]);
+        self.access
+            .roles_of_user(user)
+            .is_some_and(|roles| roles.meets(loads))
+    }
+
     fn call(
         &self,
         user: String,

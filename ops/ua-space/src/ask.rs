@@ -3,12 +3,13 @@
 use std::fs::File;
 use std::io::{self, Read, Write as _};
 
+use http_client::encoded;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use crate::arguments::Ask;
 use crate::exit::Failure;
-use crate::http::{Answer, Server, encoded};
+use crate::http::{Answer, Server};
 use crate::live::{Table, harmless, is_coloured};
 use crate::survey::look;
 

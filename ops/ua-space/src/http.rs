@@ -187,20 +187,6 @@ impl Server {
     }
 }
 
-/// Percent-encodes a value for a query.
-pub(crate) fn encoded(value: &str) -> String {
-    let mut text = String::with_capacity(value.len());
-    for byte in value.bytes() {
-        match byte {
-            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
-                text.push(byte.into())
-            }
-            _ => text.push_str(&format!("%{byte:02X}")),
-        }
-    }
-    text
-}
-
 /// Plain JSON, which is accepted even where the server also offers the SPARQL results format.
 const JSON: &str = "application/json";
 const RESULTS: &str = "application/sparql-results+json, application/n-triples";
@@ -236,10 +222,5 @@ mod tests {
         for url in ["", "http://", "http://a:b", "http://u@h:1", "http://h:1 2"] {
             assert!(of(url).is_err(), "{url}");
         }
-    }
-
-    #[test]
-    fn values_of_a_query_are_escaped() {
-        assert_eq!(encoded("urn:a b&c=ü"), "urn%3Aa%20b%26c%3D%C3%BC");
     }
 }

@@ -2,12 +2,13 @@
 
 use std::io::{self, Write as _};
 
+use http_client::encoded;
 use serde::Deserialize;
 
 use crate::arguments::PlanArguments;
 use crate::ask::{parsed, refusal};
 use crate::exit::Failure;
-use crate::http::{Server, encoded};
+use crate::http::Server;
 use crate::live::{Table, harmless, is_coloured};
 use crate::survey::look;
 

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
+use http_client::encoded;
 use serde_json::json;
 
 use crate::arguments::{ProcessArguments, ProcessVerb};
 use crate::exit::Failure;
-use crate::http::encoded;
 use crate::input::read;
 use crate::live::harmless;
 use crate::report::{say, warn};

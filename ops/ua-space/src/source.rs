@@ -3,12 +3,13 @@
 use std::io::{self, Write as _};
 use std::path::Path;
 
+use http_client::encoded;
 use serde::Deserialize;
 
 use crate::arguments::{MesAt, Source, SourceAt, SourceVerb};
 use crate::ask::refusal;
 use crate::exit::Failure;
-use crate::http::{Answer, Change, Server, encoded};
+use crate::http::{Answer, Change, Server};
 use crate::input::read;
 use crate::live::{Table, harmless, is_coloured};
 use crate::report::say;
@@ -242,24 +243,11 @@ pub(crate) fn change(
 
 /// Returns the kind of a source by the name and the contents of its file.
 fn kind_of(file: &str, contents: &[u8]) -> Result<&'static str, Failure> {
-    let ending = Path::new(file).extension();
-    let ending = ending
-        .and_then(|ending| ending.to_str())
-        .unwrap_or_default();
-    let has = |text: &[u8]| contents.windows(text.len()).any(|window| window == text);
-    match ending.to_ascii_lowercase().as_str() {
-        "ttl" | "nt" => Ok("file"),
-        "aml" | "mtp" | "amlx" => Ok("mtp"),
-        "xml" if has(b"UANodeSet") => Ok("nodeset"),
-        "xml" if has(b"CAEXFile") => Ok("mtp"),
-        "bpmn" | "batchml" => Ok("process"),
-        "xml" if has(b"http://www.mesa.org/xml/B2MML") || has(b"/spec/BPMN/20100524/MODEL") => {
-            Ok("process")
-        }
-        _ => Err(Failure::Usage(format!(
+    supervisor::source_kind(file, contents).ok_or_else(|| {
+        Failure::Usage(format!(
             "{file}: give its --kind: file (Turtle), nodeset, mtp or process (Turtle, or a recipe)"
-        ))),
-    }
+        ))
+    })
 }
 
 /// Returns the findings about a source.
@@ -297,25 +285,5 @@ mod tests {
         assert!(conclusion(&unchecked).contains("were not checked"));
         assert!(told(true).is_ok());
         assert!(matches!(told(false), Err(Failure::Told)));
-    }
-
-    #[test]
-    fn the_kind_of_a_source_is_found_by_its_file() {
-        for (file, contents, kind) in [
-            ("a.ttl", "", Some("file")),
-            ("A.MTP", "", Some("mtp")),
-            ("di.xml", "<UANodeSet>", Some("nodeset")),
-            ("m.xml", "<c:CAEXFile>", Some("mtp")),
-            (
-                "b.xml",
-                "<B xmlns='http://www.mesa.org/xml/B2MML'>",
-                Some("process"),
-            ),
-            ("b.bpmn", "", Some("process")),
-            ("x.xml", "<html>", None),
-            ("-", "", None),
-        ] {
-            assert_eq!(kind_of(file, contents.as_bytes()).ok(), kind, "{file}");
-        }
     }
 }

@@ -169,6 +169,7 @@ impl Site {
             path if path == "/sources" || path.starts_with("/sources/") => {
                 return self.sources(request).await;
             }
+            path if path.starts_with("/check/") => return self.check(request).await,
             path if path == "/jobs" || path.starts_with("/jobs/") => {
                 return self.jobs(request).await;
             }
@@ -194,7 +195,7 @@ impl Site {
                 None => match self.made_page(path).await? {
                     Some(page) => Ok(content(JSON, page.into_bytes())),
                     None => Err(Refusal::unknown(
-                        "there are /sparql, /update, /store, /sources, /jobs, /ask, /ask/NAME, /graphs, /data, /report and /status here"
+                        "there are /sparql, /update, /store, /sources, /check, /jobs, /ask, /ask/NAME, /graphs, /data, /report and /status here"
                             .to_owned(),
                     )),
                 },

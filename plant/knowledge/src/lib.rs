@@ -46,7 +46,7 @@ pub use query::Limits;
 pub use question::{Answer, QUESTIONS, Question, QuestionFault};
 pub use source::{Source, SourceKind};
 pub use store::{Knowledge, KnowledgeFault, Lasting, SourceStatus};
-pub use writes::{Jobs, May, SourceFiles, Writes};
+pub use writes::{Jobs, May, SourceCheck, SourceFiles, SourceFinding, Writes};
 
 /// Returns an empty folder for a test.
 #[cfg(test)]

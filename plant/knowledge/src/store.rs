@@ -273,6 +273,14 @@ impl Knowledge {
         self.take(source, document, false, at).map(drop)
     }
 
+    /// Checks the statements of a Turtle file. Returns their number.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`].
+    pub fn check_turtle(turtle: &str) -> Result<usize, KnowledgeFault> {
+        parsed(RdfFormat::Turtle, turtle.as_bytes()).map(|triples| triples.len())
+    }
+
     /// Removes a source atomically for all readers. Returns whether it existed.
     ///
     /// # Errors

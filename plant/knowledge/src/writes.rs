@@ -12,6 +12,7 @@ use hyper::body::Incoming;
 use hyper::header::{AUTHORIZATION, CONTENT_TYPE, ORIGIN};
 use hyper::{Method, Request, Response, StatusCode};
 use oxigraph::io::RdfFormat;
+use serde::Serialize;
 use serde_json::json;
 use tokio::sync::Semaphore;
 
@@ -52,6 +53,9 @@ pub trait SourceFiles: Send + Sync {
     /// The reason, with the line if there is one. Then nothing has changed.
     fn put(&self, kind: SourceKind, name: &str, contents: &[u8]) -> Result<bool, String>;
 
+    /// Checks the contents of a source, and changes nothing.
+    fn check(&self, kind: SourceKind, name: &str, contents: &[u8]) -> SourceCheck;
+
     /// Removes a source. Returns whether it existed.
     ///
     /// # Errors
@@ -60,6 +64,28 @@ pub trait SourceFiles: Send + Sync {
 
     /// Returns all sources and the findings about them, as JSON.
     fn list(&self) -> serde_json::Value;
+}
+
+/// The result of a check of a source.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct SourceCheck {
+    /// Whether the source can be added.
+    pub accepted: bool,
+    /// Whether it would replace a source.
+    pub replaces: bool,
+    /// The findings in the order of the file.
+    pub findings: Vec<SourceFinding>,
+}
+
+/// A finding in the contents of a source.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct SourceFinding {
+    /// The line, from 1, if it is known.
+    pub line: Option<usize>,
+    /// Description of the finding.
+    pub what: String,
+    /// Whether the source cannot be added because of it.
+    pub refused: bool,
 }
 
 /// Runs of processes that clients start and stop.
@@ -267,21 +293,7 @@ impl Site {
             }
             return Ok(json_page(&files.list()));
         }
-        let named = rest.trim_start_matches('/').split_once('/');
-        let named = named.and_then(|(kind, name)| {
-            let kind: SourceKind = kind.parse().ok()?;
-            let is_file = matches!(
-                kind,
-                SourceKind::NodeSet | SourceKind::Mtp | SourceKind::File | SourceKind::Process
-            );
-            let name = unescaped(name)?;
-            (is_file && !name.is_empty() && name.len() <= LONGEST_NAME).then_some((kind, name))
-        });
-        let Some((kind, name)) = named else {
-            let why =
-                "a source is /sources/KIND/NAME; the kinds are nodeset, mtp, file and process";
-            return Err(Refusal::unknown(why.to_owned()));
-        };
+        let (kind, name) = named(rest)?;
         let method = request.method().clone();
         self.may_write(&request).await?;
         let done = match method {
@@ -306,6 +318,26 @@ impl Site {
         }
     }
 
+    /// Checks the contents of a source: `/check/KIND/NAME`. The rights are those of a change,
+    /// because a check reads a file of any contents.
+    pub(crate) async fn check(
+        &self,
+        request: Request<Incoming>,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        if request.method() != Method::POST {
+            return Err(Refusal::method("POST"));
+        }
+        let path = request.uri().path().to_owned();
+        let (kind, name) = named(path.strip_prefix("/check").unwrap_or_default())?;
+        let files = Arc::clone(&self.may_write(&request).await?.files);
+        let contents = self.upload(request, LARGEST_FILE).await?;
+        let checked = tokio::task::spawn_blocking(move || files.check(kind, &name, &contents));
+        match checked.await {
+            Ok(checked) => Ok(json_page(&json!(checked))),
+            Err(error) => Err(failed(&error)),
+        }
+    }
+
     /// Reads the body of a change.
     async fn upload(&self, request: Request<Incoming>, most: usize) -> Result<Vec<u8>, Refusal> {
         let place = UPLOADS.acquire().await;
@@ -324,6 +356,24 @@ impl Site {
             Err(_) => Err(Refusal::malformed("the request broke off")),
         }
     }
+}
+
+/// Returns the source in a path `/KIND/NAME`.
+fn named(path: &str) -> Result<(SourceKind, String), Refusal> {
+    let named = path.trim_start_matches('/').split_once('/');
+    let named = named.and_then(|(kind, name)| {
+        let kind: SourceKind = kind.parse().ok()?;
+        let is_file = matches!(
+            kind,
+            SourceKind::NodeSet | SourceKind::Mtp | SourceKind::File | SourceKind::Process
+        );
+        let name = unescaped(name)?;
+        (is_file && !name.is_empty() && name.len() <= LONGEST_NAME).then_some((kind, name))
+    });
+    named.ok_or_else(|| {
+        let why = "a source is /sources/KIND/NAME; the kinds are nodeset, mtp, file and process";
+        Refusal::unknown(why.to_owned())
+    })
 }
 
 /// Checks whether a client may do something: the request does not come from a page of another site

@@ -4,7 +4,10 @@
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 
-use knowledge::{Endpoint, Jobs, Knowledge, Limits, Source, SourceFiles, SourceKind, Writes};
+use knowledge::{
+    Endpoint, Jobs, Knowledge, Limits, Source, SourceCheck, SourceFiles, SourceFinding, SourceKind,
+    Writes,
+};
 
 use crate::http::{Answered, send};
 
@@ -20,6 +23,19 @@ impl SourceFiles for Files {
         let mut all = self.0.lock().unwrap();
         all.push((kind, name.to_owned(), contents.len()));
         Ok(all.len() == 1)
+    }
+
+    fn check(&self, _kind: SourceKind, _name: &str, contents: &[u8]) -> SourceCheck {
+        let faults = contents.is_empty().then(|| SourceFinding {
+            line: Some(7),
+            what: "line 7: it is empty".to_owned(),
+            refused: true,
+        });
+        SourceCheck {
+            accepted: !contents.is_empty(),
+            replaces: false,
+            findings: faults.into_iter().collect(),
+        }
     }
 
     fn remove(&self, kind: SourceKind, name: &str) -> Result<bool, String> {
@@ -279,6 +295,23 @@ async fn sources_are_handed_to_their_readers() {
 }
 
 #[tokio::test]
+async fn a_check_of_a_source_adds_nothing() {
+    let (endpoint, _) = site(true).await;
+    let at = endpoint.address();
+    let check = async |body: &str| request(at, "POST /check/mtp/a%20module", &[], body).await;
+    let good = check("x").await;
+    assert_eq!(good.status, 200);
+    assert!(good.body.contains(r#""accepted":true"#), "{}", good.body);
+    let bad = check("").await;
+    assert_eq!(bad.status, 200);
+    assert!(bad.body.contains(r#""line":7"#), "{}", bad.body);
+    let listed = request(at, "GET /sources", &[], "").await;
+    assert_eq!(listed.body.trim(), r#"{"sources":0}"#);
+    assert_eq!(request(at, "GET /check/mtp/x", &[], "").await.status, 405);
+    assert_eq!(request(at, "POST /check/run/x", &[], "").await.status, 404);
+}
+
+#[tokio::test]
 async fn only_users_with_the_role_write_and_no_page_of_another_site() {
     let (endpoint, knowledge) = site(false).await;
     let at = endpoint.address();
@@ -300,6 +333,7 @@ async fn only_users_with_the_role_write_and_no_page_of_another_site() {
         "DELETE /store?default",
         "PUT /sources/mtp/x",
         "DELETE /sources/mtp/x",
+        "POST /check/mtp/x",
     ] {
         assert_eq!(request(at, line, &[], "x").await.status, 401, "{line}");
     }

@@ -158,3 +158,22 @@ fn the_map_shows_rates_and_programs_that_are_not_ready() {
     );
     assert_eq!(shown["worlds"]["2"]["topics"], 0);
 }
+
+#[test]
+fn the_knowledge_has_a_mes_once_its_status_was_read() {
+    let mut board = Board::default();
+    let mut viewer = Viewer::new(View::parse("view=knowledge").unwrap());
+    let mut shown = |board: &mut Board, millis| {
+        let event = viewer.next(board, at(millis).since);
+        event.map(|event| data(&event)["mes"].clone())
+    };
+    assert_eq!(shown(&mut board, 0), Some(Value::Null), "not known yet");
+    let program = |status| Program {
+        source: "http://127.0.0.1:8087".to_owned(),
+        status: Ok(status),
+    };
+    board.set_programs(vec![program(json!({ "program": "bridge-ros1" }))]);
+    assert_eq!(shown(&mut board, 1000), Some(json!(false)));
+    board.set_programs(vec![program(json!({ "processes": [] }))]);
+    assert_eq!(shown(&mut board, 2000), Some(json!(true)));
+}

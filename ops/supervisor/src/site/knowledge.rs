@@ -1,0 +1,309 @@
+//! The requests about the knowledge of the plant, which `ua-mes` answers: queries by every reader,
+//! and files by users with the role for it.
+//!
+//! `ua-mes` decides about each file too. Its users may differ from those of the page: the page then
+//! passes on the password that the user gives for `ua-mes`.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use bridge_node::PageBody;
+use bytes::Bytes;
+use hyper::header::{CONTENT_LENGTH, HeaderMap};
+use hyper::{Request, Response, StatusCode, Uri};
+use serde::Deserialize;
+use serde_json::{Value, json};
+use tracing::{info, warn};
+
+use super::{RequestBody, bytes, is_loopback_name};
+use crate::fetch::FetchFault;
+use crate::mes::{Credentials, Mes, MesFault, SourceFile, source_kind};
+use crate::operations::Operations;
+use crate::page::Page;
+use crate::responses::{Refusal, json_page};
+use crate::session::Session;
+use crate::table::MOST_ROWS;
+use crate::value::cut;
+use crate::view::pairs;
+
+/// The path of the named questions.
+pub(super) const QUESTIONS: &str = "/knowledge/questions";
+/// The path of the plan of a process.
+pub(super) const PLAN: &str = "/knowledge/plan";
+/// The path of queries.
+pub(super) const QUERY: &str = "/knowledge/query";
+/// The path of a file that is checked.
+pub(super) const CHECK: &str = "/knowledge/check";
+/// The path of a file that is checked and loaded.
+pub(super) const LOAD: &str = "/knowledge/load";
+
+/// The body of a query: SPARQL, or a named question with its parameters.
+#[derive(Deserialize)]
+#[serde(untagged)]
+pub(super) enum Query {
+    /// A query of SPARQL.
+    Sparql { query: String },
+    /// A named question.
+    Named {
+        question: String,
+        #[serde(default)]
+        parameters: BTreeMap<String, String>,
+    },
+}
+
+/// Returns the media type of a request whose body is a file.
+pub(super) fn media(path: &str) -> Option<&'static str> {
+    matches!(path, CHECK | LOAD).then_some("application/octet-stream")
+}
+
+/// Answers with the named questions, or with the plan of a process.
+pub(super) async fn read(page: &Page, uri: &Uri) -> Result<Response<PageBody>, Refusal> {
+    let _place = page
+        .places
+        .queries
+        .try_acquire()
+        .map_err(|_| busy("queries"))?;
+    let mes = mes(page).await?;
+    if uri.path() == QUESTIONS {
+        let mut shown = mes.questions().await.map_err(refusal)?;
+        if let Some(shown) = shown.as_object_mut() {
+            shown.insert("most_rows".to_owned(), MOST_ROWS.into());
+            shown.insert("largest_file".to_owned(), LARGEST_FILE.into());
+        }
+        return Ok(json_page(&shown));
+    }
+    let process = parameter(uri, "process")
+        .ok_or_else(|| Refusal::new(StatusCode::BAD_REQUEST, "name the process as ?process=IRI"))?;
+    let plan = mes.plan(&process).await.map_err(refusal)?;
+    Ok(json_page(&plan))
+}
+
+/// Answers a query.
+pub(super) async fn query(page: &Page, query: Query) -> Result<Response<PageBody>, Refusal> {
+    let _place = page
+        .places
+        .queries
+        .try_acquire()
+        .map_err(|_| busy("queries"))?;
+    let mes = mes(page).await?;
+    let table = match query {
+        Query::Sparql { query } => mes.query(query).await,
+        Query::Named {
+            question,
+            parameters,
+        } => mes.ask(&question, parameters.iter()).await,
+    };
+    table.map(|table| json_page(&table)).map_err(refusal)
+}
+
+/// Checks a file, and loads it if that is wanted and nothing is wrong with it.
+pub(super) async fn upload(
+    page: &Page,
+    operations: &dyn Operations,
+    session: &Session,
+    request: Request<impl RequestBody>,
+) -> Result<Response<PageBody>, Refusal> {
+    let user = session.user.as_str();
+    require_role(operations, user)?;
+    let loads = request.uri().path() == LOAD;
+    let by = credentials(request.headers(), user)?;
+    let _place = page.places.files.try_acquire().map_err(|_| busy("files"))?;
+    let file = source_file(request).await?;
+    let mes = mes(page).await?;
+    if !is_loopback_name(mes.authority()) {
+        let why = "ua-mes is not on this host: load the file there with ua-space source add";
+        return Err(Refusal::new(StatusCode::CONFLICT, why));
+    }
+    if loads {
+        // The browser may leave before the outcome is known.
+        report(user, &file, "load requested");
+    }
+    let done = checked(page, &mes, (&file, by.as_ref()), loads).await;
+    report(user, &file, outcome(&done));
+    done.map(|answer| json_page(&answer))
+}
+
+fn require_role(operations: &dyn Operations, user: &str) -> Result<(), Refusal> {
+    if operations.may_load(user) {
+        return Ok(());
+    }
+    warn!(
+        user,
+        "refused to load a source on the page: no role engineer"
+    );
+    let why = format!("{user} has no role that permits it: sources need the role engineer");
+    Err(Refusal::new(StatusCode::FORBIDDEN, why))
+}
+
+/// Logs what was done with a file.
+fn report(user: &str, file: &SourceFile, outcome: &str) {
+    let (kind, source, size) = (file.kind, cut(&file.name, 100), file.contents.len());
+    info!(
+        user,
+        kind, source, size, outcome, "source sent from the page"
+    );
+}
+
+/// Returns the outcome of a file for the log.
+fn outcome(done: &Result<Value, Refusal>) -> &'static str {
+    match done {
+        Ok(answer) if answer["needs_password"] == true => "no user of ua-mes",
+        Ok(answer) if answer["loaded"] == true => "loaded",
+        Ok(answer) if answer["accepted"] == true => "checked",
+        Ok(_) => "not accepted",
+        Err(Refusal(StatusCode::GATEWAY_TIMEOUT, _)) => "unknown",
+        Err(_) => "refused",
+    }
+}
+
+/// Returns the file of a request, whose kind its name and its contents show.
+async fn source_file(request: Request<impl RequestBody>) -> Result<SourceFile, Refusal> {
+    let name = parameter(request.uri(), "name").unwrap_or_default();
+    if name.is_empty() || name.len() > LONGEST_NAME {
+        let why = "name the file as ?name=FILE, in at most 256 bytes";
+        return Err(Refusal::new(StatusCode::BAD_REQUEST, why));
+    }
+    let contents = file(request).await?;
+    let kind = source_kind(&name, &contents).ok_or_else(|| {
+        let why = format!(
+            "`{}` is no source: send .aml, .mtp, .amlx, .ttl, .nt, .bpmn, .batchml, or .xml with a \
+             NodeSet, a manifest or a recipe",
+            cut(&name, 100)
+        );
+        Refusal::new(StatusCode::BAD_REQUEST, why)
+    })?;
+    Ok(SourceFile {
+        kind,
+        name,
+        contents,
+    })
+}
+
+/// Checks a file, and loads it if `loads` and it was accepted.
+async fn checked(
+    page: &Page,
+    mes: &Mes,
+    (file, by): (&SourceFile, Option<&Credentials>),
+    loads: bool,
+) -> Result<Value, Refusal> {
+    if let Some(by) = by {
+        let now = page.at().since;
+        let may_try = page.sessions().may_try(&by.user, now);
+        may_try.map_err(|why| Refusal::new(StatusCode::TOO_MANY_REQUESTS, why))?;
+        // Counted before the check, so that attempts at the same time are limited too.
+        page.sessions().fail(&by.user, now);
+    }
+    let checked = mes.check(file, by).await;
+    if let Some(by) = by.filter(|_| checked.is_ok()) {
+        page.sessions().succeed(&by.user);
+    }
+    let mut answer = match checked {
+        Ok(answer) => answer,
+        Err(MesFault::Refused { status, .. }) if status == StatusCode::UNAUTHORIZED => {
+            return Ok(json!({ "needs_password": true, "accepted": false, "loaded": false }));
+        }
+        Err(fault) => return Err(refusal(fault)),
+    };
+    let loads = loads && answer.get("accepted") == Some(&Value::Bool(true));
+    if loads {
+        mes.load(file, by).await.map_err(unknown_or_refused)?;
+    }
+    if let Some(answer) = answer.as_object_mut() {
+        answer.insert("loaded".to_owned(), loads.into());
+        answer.insert("kind".to_owned(), file.kind.into());
+    }
+    Ok(answer)
+}
+
+/// Returns the user of `ua-mes`: the signed-in user, with the password that the request has for it.
+fn credentials(headers: &HeaderMap, user: &str) -> Result<Option<Credentials>, Refusal> {
+    let Some(given) = headers.get("x-mes-password") else {
+        return Ok(None);
+    };
+    let decoded = STANDARD.decode(given.as_bytes()).ok();
+    let password = decoded.and_then(|bytes| String::from_utf8(bytes).ok());
+    let password = password.ok_or_else(|| {
+        let why = "the password for ua-mes is not in base64 of UTF-8";
+        Refusal::new(StatusCode::BAD_REQUEST, why)
+    })?;
+    Ok(Some(Credentials {
+        user: user.to_owned(),
+        password,
+    }))
+}
+
+/// Returns the file in a request.
+async fn file(request: Request<impl RequestBody>) -> Result<Bytes, Refusal> {
+    let length = request.headers().get(CONTENT_LENGTH);
+    let length = length.and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
+    let too_large = || {
+        let why = format!(
+            "the file has more than {} MiB: load it with ua-space source add",
+            LARGEST_FILE >> 20
+        );
+        Refusal::new(StatusCode::PAYLOAD_TOO_LARGE, why)
+    };
+    if length.is_some_and(|length| length > LARGEST_FILE) {
+        return Err(too_large());
+    }
+    let read = bytes(request, (LARGEST_FILE, FILE_TIME)).await;
+    read.map_err(|Refusal(status, why)| match status {
+        StatusCode::PAYLOAD_TOO_LARGE => too_large(),
+        status => Refusal(status, why),
+    })
+}
+
+async fn mes(page: &Page) -> Result<Mes, Refusal> {
+    page.mes().await.ok_or_else(|| {
+        let why = "no ua-mes is known: name the address of its --sparql with --status URL";
+        Refusal::new(StatusCode::NOT_FOUND, why)
+    })
+}
+
+fn parameter(uri: &Uri, name: &str) -> Option<String> {
+    let pairs = pairs(uri.query().unwrap_or_default()).into_iter();
+    let mut values = pairs.filter(|(key, _)| key == name);
+    values.next().map(|(_, value)| value)
+}
+
+fn busy(of: &str) -> Refusal {
+    let why = format!("other {of} are being answered: try again in a few seconds");
+    Refusal::new(StatusCode::SERVICE_UNAVAILABLE, why)
+}
+
+fn refusal(fault: MesFault) -> Refusal {
+    let status = match &fault {
+        // The session of the page is another one.
+        MesFault::Refused { status, .. } if *status == StatusCode::UNAUTHORIZED => {
+            StatusCode::FORBIDDEN
+        }
+        MesFault::Refused { status, .. } => *status,
+        MesFault::TooLarge => StatusCode::INSUFFICIENT_STORAGE,
+        MesFault::Fetch(_) | MesFault::Unreadable(_) | MesFault::Uri(_) | MesFault::Header(_) => {
+            StatusCode::BAD_GATEWAY
+        }
+    };
+    Refusal(status, fault.to_string())
+}
+
+/// Returns the refusal of a change: without a response the change may have been made.
+fn unknown_or_refused(fault: MesFault) -> Refusal {
+    let was_sent = matches!(
+        fault,
+        MesFault::Fetch(FetchFault::Late(_) | FetchFault::Exchange(_)) | MesFault::TooLarge
+    );
+    if was_sent {
+        let why = format!("the outcome is unknown, the file may have been loaded: {fault}");
+        return Refusal(StatusCode::GATEWAY_TIMEOUT, why);
+    }
+    refusal(fault)
+}
+
+const LARGEST_FILE: usize = 32 << 20;
+const LONGEST_NAME: usize = 256;
+const FILE_TIME: Duration = Duration::from_secs(60);
+
+#[cfg(test)]
+mod tests;
