@@ -179,6 +179,9 @@ document! {
         /// ApplicationUris of two or three redundant servers, by their `--rank`, instead of
         /// `application_uri`.
         redundant: Vec<At<String>>,
+        /// Endpoints of the servers of `redundant`, in the same order. Each server has the endpoint
+        /// of its rank unless `--endpoint` gives another, and lists the others in FindServers.
+        redundant_endpoints: Vec<At<String>>,
         /// Security policies that the server offers. Default: all, and `None` only if the endpoint
         /// is a loopback address.
         security: Vec<At<SecurityEntry>>,

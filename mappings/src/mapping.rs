@@ -243,13 +243,17 @@ impl Mapping {
     }
 
     /// Returns the mapping for the redundant server of a rank, which counts from 1: its
-    /// ApplicationUri is that of the rank. Returns `None` if the mapping has no such server.
+    /// ApplicationUri and its endpoint, if it is named, are those of the rank. Returns `None` if
+    /// the mapping has no such server.
     #[must_use]
     pub fn for_rank(&self, rank: u8) -> Option<Self> {
         let at = usize::from(rank).checked_sub(1)?;
         let uri = self.server.redundant.get(at)?.clone();
         let mut mapping = self.clone();
         mapping.server.application_uri = uri;
+        if let Some(endpoint) = self.server.redundant_endpoints.get(at) {
+            mapping.server.endpoint = endpoint.clone();
+        }
         Some(mapping)
     }
 
@@ -475,6 +479,8 @@ pub struct Server {
     /// ApplicationUris of redundant servers by their rank, which counts from 1; empty without
     /// redundancy.
     pub redundant: Vec<String>,
+    /// Endpoints of the redundant servers by their rank; empty if the document names none.
+    pub redundant_endpoints: Vec<Endpoint>,
     /// Security policies that it offers, without repetition and not empty; `None` if the document
     /// names none.
     pub security: Option<Vec<SecurityPolicy>>,
@@ -547,6 +553,7 @@ impl Default for Server {
             endpoint: Endpoint::default(),
             application_uri: "urn:ua-bridge:server".to_owned(),
             redundant: Vec::new(),
+            redundant_endpoints: Vec::new(),
             security: None,
             anonymous: Anonymous::Usual,
             refuse_other_hosts: false,

@@ -58,6 +58,31 @@ fn redundant_servers_have_two_or_three_different_uris() {
 }
 
 #[test]
+fn redundant_servers_have_an_endpoint_each() {
+    let text = |endpoints: &str| {
+        format!(
+            "spaces: [{{id: 1}}]\nserver: {{redundant: [\"urn:cell:a\", \"urn:cell:b\"], \
+             redundant_endpoints: {endpoints}}}\n"
+        )
+    };
+    let mapping = sound(&text("[\"opc.tcp://host-a\", \"opc.tcp://host-b:4841\"]"));
+    let endpoint = |rank| {
+        let ranked = mapping.for_rank(rank).unwrap();
+        ranked.server().endpoint.to_string()
+    };
+    assert_eq!(endpoint(1), "opc.tcp://host-a:4840");
+    assert_eq!(endpoint(2), "opc.tcp://host-b:4841");
+    for faulty in [
+        "[\"opc.tcp://host-a\"]",
+        "[\"opc.tcp://host-a\", \"opc.tcp://host-a\"]",
+        "[\"opc.tcp://host-a\", \"host-b\"]",
+    ] {
+        let checked = Mapping::from_yaml(&text(faulty), "cell.yaml");
+        assert_eq!(codes(&checked), [Code::Endpoint], "{faulty}");
+    }
+}
+
+#[test]
 fn a_document_whose_keys_have_no_values_is_zero_configuration() {
     for text in ["{}", "spaces:\nvariables:\n", "pubsub: {}\nserver: ~\n"] {
         let mapping = sound(text);

@@ -288,10 +288,14 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
     });
     let security =
         given(&entry.security).and_then(|(entries, place)| security(entries, place, findings));
+    let redundant = redundant(&entry.redundant, findings);
+    let redundant_endpoints =
+        redundant_endpoints(&entry.redundant_endpoints, redundant.len(), findings);
     let server = Server {
         endpoint: endpoint.unwrap_or(default.endpoint),
         application_uri: application_uri.unwrap_or(default.application_uri),
-        redundant: redundant(&entry.redundant, findings),
+        redundant,
+        redundant_endpoints,
         security,
         anonymous: permissions::anonymous(entry),
         refuse_other_hosts: given(&entry.refuse_other_hosts).is_some_and(|(refuse, _)| *refuse),
@@ -341,6 +345,43 @@ fn redundant(field: &Field<Vec<At<String>>>, findings: &mut Findings) -> Vec<Str
         return Vec::new();
     }
     uris
+}
+
+/// Reads the endpoints of redundant servers, one for each of their ApplicationUris.
+fn redundant_endpoints(
+    field: &Field<Vec<At<String>>>,
+    servers: usize,
+    findings: &mut Findings,
+) -> Vec<Endpoint> {
+    let Some((entries, place)) = given(field) else {
+        return Vec::new();
+    };
+    let mut endpoints: Vec<Endpoint> = Vec::new();
+    for At { place, value } in entries {
+        let Some(text) = value else {
+            return Vec::new();
+        };
+        let Some(endpoint) = remote_endpoint(text, *place, findings) else {
+            return Vec::new();
+        };
+        if endpoints.contains(&endpoint) {
+            let message = format!("{endpoint} is the endpoint of two redundant servers");
+            let note = findings.error(Code::Endpoint, *place, message);
+            note.help("give each server an endpoint of its own");
+            return Vec::new();
+        }
+        endpoints.push(endpoint);
+    }
+    if endpoints.len() != servers {
+        let message = format!(
+            "{} endpoints for {servers} servers of `redundant`",
+            endpoints.len()
+        );
+        let note = findings.error(Code::Endpoint, place, message);
+        note.help("list an endpoint for each ApplicationUri of `redundant`, in the same order");
+        return Vec::new();
+    }
+    endpoints
 }
 
 /// Returns the clients to which the server connects.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bridge_node::{Failure, FailureKind};
 use mappings::{SecurityPolicy, Server, ServerLimits};
-use opcua::server::{Limits, ServerBuilder, ServerHandle};
+use opcua::server::{Limits, ServerBuilder, ServerConfig, ServerHandle};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::door::{Door, UnknownClients};
 use plant_opcua::endpoint::EndpointUrl;
@@ -14,10 +14,11 @@ use plant_opcua::limits::{self, ClientLimits};
 use plant_opcua::patches;
 use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use plant_opcua::server::Security;
+use serde_json::{Value, json};
 use tokio::runtime::Runtime;
 use tracing::warn;
 
-use crate::{identity, reverse};
+use crate::{identity, redundant, reverse};
 
 /// Returns whether programs of this host only reach a server that listens at `address`.
 pub(crate) fn is_local(described: &Server, address: SocketAddr) -> bool {
@@ -67,7 +68,30 @@ pub(crate) fn server(
             builder = builder.add_endpoint(name, endpoint);
         }
     }
+    list_others(builder.config_mut(), described);
     builder
+}
+
+/// Lets FindServers return the other servers of a redundant set (OPC 10000-4, 6.6.2.4.5). The
+/// unpatched library has no setting for them, and returns its own server only.
+fn list_others(config: &mut ServerConfig, described: &Server) {
+    let others = redundant::others(described).map(|(uri, endpoint)| {
+        json!({
+            "application_uri": uri,
+            "discovery_urls": [endpoint.to_string()],
+        })
+    });
+    let others: Vec<Value> = others.collect();
+    if others.is_empty() {
+        return;
+    }
+    let Ok(Value::Object(mut settings)) = serde_json::to_value(&*config) else {
+        return;
+    };
+    settings.insert("redundant_servers".to_owned(), others.into());
+    if let Ok(listed) = serde_json::from_value(settings.into()) {
+        *config = listed;
+    }
 }
 
 /// Returns the limits of resources of clients.

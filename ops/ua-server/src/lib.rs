@@ -309,7 +309,8 @@ impl Program for UaServer {
         let url = match &self.endpoint {
             Some(url) => url.clone(),
             None => {
-                let endpoint = context.mapping.server().endpoint.to_string();
+                let mapping = redundant::ranked(&context.mapping, self.rank);
+                let endpoint = mapping.server().endpoint.to_string();
                 endpoint.parse().map_err(|error| {
                     Failure::new(
                         FailureKind::Configuration,

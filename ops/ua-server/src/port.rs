@@ -40,7 +40,7 @@ use crate::nodes::ClientWrite;
 use crate::operations::PageOperations;
 use crate::others::Others;
 use crate::pubsub::PubSub;
-use crate::redundant::{ServerRole, ranked};
+use crate::redundant::{ServerRole, ServerSet, ranked};
 use crate::sks::Sks;
 use crate::sources::Sourced;
 use crate::structures::Types;
@@ -116,7 +116,8 @@ impl ServerPort {
         let mdns = matches!(&setup.announce, Some(to) if to.mdns.is_some());
         let shown = (&setup.sks, &pubsub, &alarms);
         let facets = start::facets(&security, &layout);
-        let described_core = (described, facets, setup.rank);
+        let set = ServerSet::new(described, setup.rank);
+        let described_core = (described, facets, &set);
         let core = start::core(shown, (&certificates, mdns), described_core, &access);
         let builder = endpoint::server(described, (&setup.url, port), &security);
         let (trusts_any, limits) = (setup.trust_any_client, endpoint::clients(described.limits));
@@ -164,7 +165,7 @@ impl ServerPort {
             certificates,
         };
         let running = (runtime, serving);
-        let ranked = (setup.rank, role);
+        let ranked = (setup.rank, role, set);
         let content = (&**mapping, &*layout);
         let states = (pubsub, alarms);
         Ok(Self {
@@ -343,6 +344,7 @@ impl Port for ServerPort {
     fn counted(&mut self, router: &Router) {
         self.shown.counted(router);
         self.server.show_service_level(self.shown.silence());
+        self.server.show_set(router);
     }
 
     fn drop_waiting(&mut self, _at_once: bool) {
@@ -423,6 +425,10 @@ impl Port for ServerPort {
 
     fn certificate(&self) -> Option<serde_json::Value> {
         self.server.certificate()
+    }
+
+    fn service_level(&self) -> Option<u8> {
+        self.server.service_level()
     }
 
     fn application(&self) -> Option<Application> {

@@ -3,15 +3,38 @@
 //!
 //! All servers of a set show the values of the space, so that the set is Hot. The active server
 //! alone sends the values that clients write, and calls Methods. The others refuse both, and have a
-//! lower ServiceLevel.
+//! lower ServiceLevel. Each server shows the ServiceLevels of all servers of the set, which their
+//! heartbeats carry.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
+use bridge_core::{Redundancy, Role};
 use bridge_node::Rank;
-use mappings::{Mapping, Server};
-use opcua::types::{UAString, VariableId, Variant};
+use mappings::{Endpoint, Mapping, Server};
+use opcua::server::address_space::AddressSpace;
+use opcua::sync::Mutex;
+use opcua::types::{
+    ExtensionObject, NodeId, ObjectId, ObjectTypeId, RedundantServerDataType, ReferenceTypeId,
+    ServerState, UAString, VariableId, Variant,
+};
 use plant_opcua::server::CoreValue;
+
+/// Returns the other servers of the set of a ranked server, with their endpoints.
+pub(crate) fn others(server: &Server) -> impl Iterator<Item = (&str, &Endpoint)> {
+    let endpoints = match is_member(server) {
+        true => &server.redundant_endpoints[..],
+        false => &[],
+    };
+    let servers = server.redundant.iter().map(String::as_str).zip(endpoints);
+    servers.filter(|(uri, _)| *uri != server.application_uri)
+}
+
+/// Returns whether a ranked server is one of a redundant set.
+pub(crate) fn is_member(server: &Server) -> bool {
+    server.redundant.contains(&server.application_uri)
+}
 
 /// The role of a server.
 #[derive(Debug, Clone, Default)]
@@ -43,18 +66,129 @@ pub(crate) fn ranked(mapping: &Arc<Mapping>, rank: Option<Rank>) -> Arc<Mapping>
     ranked.map_or_else(|| Arc::clone(mapping), Arc::new)
 }
 
+/// The servers of a redundant set with their ServiceLevels, as this server knows them.
+#[derive(Clone)]
+pub(crate) struct ServerSet {
+    /// The rank of this server; `None` without redundancy.
+    rank: Option<Rank>,
+    members: Arc<Mutex<Members>>,
+}
+
+/// The servers by their ranks, in the order of the ServerUriArray.
+struct Members {
+    servers: Vec<RedundantServerDataType>,
+    is_changed: bool,
+}
+
+impl Members {
+    fn set(&mut self, rank: Rank, (level, state): (u8, ServerState)) {
+        let at = usize::from(rank.get()).checked_sub(1);
+        let Some(server) = at.and_then(|at| self.servers.get_mut(at)) else {
+            return;
+        };
+        self.is_changed |= (server.service_level, server.server_state) != (level, state);
+        server.service_level = level;
+        server.server_state = state;
+    }
+}
+
+impl ServerSet {
+    /// Creates the set of a server that starts. It knows no other server.
+    pub(crate) fn new(server: &Server, rank: Option<Rank>) -> Self {
+        let uris = rank.map_or(&[][..], |_| &server.redundant);
+        let servers = uris.iter().map(|uri| RedundantServerDataType {
+            server_id: uri.as_str().into(),
+            service_level: UNREACHABLE,
+            server_state: ServerState::Unknown,
+        });
+        let set = Self {
+            rank,
+            members: Arc::new(Mutex::new(Members {
+                servers: servers.collect(),
+                is_changed: false,
+            })),
+        };
+        set.set_own(BEST_DEGRADED);
+        set
+    }
+
+    /// Sets the ServiceLevel of this server.
+    pub(crate) fn set_own(&self, level: u8) {
+        if let Some(rank) = self.rank {
+            self.members.lock().set(rank, (level, ServerState::Running));
+        }
+    }
+
+    /// Returns the ServiceLevel of this server; `None` without redundancy.
+    pub(crate) fn own(&self) -> Option<u8> {
+        let at = usize::from(self.rank?.get()).checked_sub(1)?;
+        Some(self.members.lock().servers.get(at)?.service_level)
+    }
+
+    /// Sets the other servers by their heartbeats.
+    pub(crate) fn follow(&self, redundancy: &Redundancy, now: Instant) {
+        let mut members = self.members.lock();
+        let ranks = (1..=Rank::MOST).filter_map(Rank::new);
+        for rank in ranks.filter(|rank| Some(*rank) != self.rank) {
+            let mut peers = redundancy.peers(now);
+            let peer = peers.find(|peer| peer.rank() == rank && peer.is_present(now));
+            let seen = peer.map(|peer| {
+                // A server of an earlier version does not send its level.
+                let by_role = match peer.role() {
+                    Role::Active => u8::MAX,
+                    Role::Starting | Role::Standby => BEST_DEGRADED,
+                };
+                let level = peer.service_level().unwrap_or(by_role);
+                (level, ServerState::Running)
+            });
+            members.set(rank, seen.unwrap_or((UNREACHABLE, ServerState::Unknown)));
+        }
+    }
+
+    /// Returns the RedundantServerArray (OPC 10000-5, 6.3.7 and 12.7).
+    fn value(&self) -> Variant {
+        let servers = self.members.lock().servers.clone();
+        let servers = servers.into_iter().map(ExtensionObject::from_message);
+        servers.collect::<Vec<ExtensionObject>>().into()
+    }
+
+    /// Returns the RedundantServerArray if it has changed since the last call.
+    pub(crate) fn take_change(&self) -> Option<Variant> {
+        let is_changed = std::mem::take(&mut self.members.lock().is_changed);
+        is_changed.then(|| self.value())
+    }
+}
+
+/// Makes the ServerRedundancy object of a redundant server a NonTransparentRedundancyType, with the
+/// ServerUriArray among its properties (OPC 10000-5, 6.3.9).
+pub(crate) fn prepare(core: &mut AddressSpace) {
+    let object: NodeId = ObjectId::Server_ServerRedundancy.into();
+    let before: NodeId = ObjectTypeId::ServerRedundancyType.into();
+    let after: NodeId = ObjectTypeId::NonTransparentRedundancyType.into();
+    let uris: NodeId = VariableId::Server_ServerRedundancy_ServerUriArray.into();
+    // A core namespace without the reference has none to delete.
+    let _was_there = core.delete_reference(&object, &before, ReferenceTypeId::HasTypeDefinition);
+    core.insert_reference(&object, &after, ReferenceTypeId::HasTypeDefinition);
+    core.insert_reference(&object, &uris, ReferenceTypeId::HasProperty);
+}
+
 /// Returns the values of ServerRedundancy (OPC 10000-5, 6.3.7 and 6.3.9).
-pub(crate) fn values(server: &Server, rank: Option<Rank>) -> Vec<(VariableId, CoreValue)> {
-    let support = match rank {
+pub(crate) fn values(server: &Server, set: &ServerSet) -> Vec<(VariableId, CoreValue)> {
+    let support = match set.rank {
         Some(_) => HOT,
         None => NONE,
     };
-    let uris = match rank {
+    let uris = match set.rank {
         Some(_) => &server.redundant[..],
         None => &[],
     };
     let uris: Vec<UAString> = uris.iter().map(|uri| uri.as_str().into()).collect();
+    let set = set.clone();
     vec![
+        (
+            VariableId::Server_ServerRedundancy_RedundantServerArray,
+            CoreValue::Read(Arc::new(move |_| set.value())),
+        ),
         (
             VariableId::Server_ServerRedundancy_RedundancySupport,
             Variant::from(support).into(),
@@ -94,6 +228,8 @@ impl Condition {
 /// RedundancySupport (OPC 10000-5, 12.5).
 const NONE: i32 = 0;
 const HOT: i32 = 3;
+/// The ServiceLevel of a server that this server does not reach: clients do not connect to it.
+const UNREACHABLE: u8 = 0;
 /// The ServiceLevel of a server without data.
 const NO_DATA: u8 = 1;
 /// The best ServiceLevel of a server with parts that are not available.
@@ -152,6 +288,43 @@ mod tests {
     }
 
     #[test]
+    fn the_set_shows_the_levels_of_all_servers_and_each_change_once() {
+        let text = "spaces: [{id: 1}]\nserver: {redundant: [\"urn:cell:a\", \"urn:cell:b\"]}\n";
+        let mapping = Mapping::from_yaml(text, "cell.yaml").mapping.unwrap();
+        let now = bridge_node::now();
+        let rank = |number| Rank::new(number).unwrap();
+        let set = ServerSet::new(mapping.server(), Some(rank(2)));
+        let shown = || {
+            let servers = set.members.lock().servers.clone();
+            let levels = servers
+                .iter()
+                .map(|one| (one.service_level, one.server_state));
+            levels.collect::<Vec<_>>()
+        };
+        let unknown = (UNREACHABLE, ServerState::Unknown);
+        let standby = (BEST_DEGRADED, ServerState::Running);
+        assert_eq!(shown(), [unknown, standby]);
+        assert_eq!(set.own(), Some(BEST_DEGRADED));
+
+        let mut first = Redundancy::new(rank(1), 1, now);
+        first.set_service_level(Some(231));
+        let mut own = Redundancy::new(rank(2), 2, now);
+        let from = ([127, 0, 0, 1], 4840).into();
+        let _change = own.hear(first.heartbeat(), from, now);
+        set.follow(&own, now.monotonic);
+        assert_eq!(shown(), [(231, ServerState::Running), standby]);
+        assert!(set.take_change().is_some());
+        set.follow(&own, now.monotonic);
+        assert!(set.take_change().is_none());
+
+        set.set_own(255);
+        set.follow(&own, now.monotonic + std::time::Duration::from_secs(1));
+        assert_eq!(shown(), [unknown, (255, ServerState::Running)]);
+        assert!(set.take_change().is_some());
+        assert_eq!(ServerSet::new(mapping.server(), None).own(), None);
+    }
+
+    #[test]
     fn each_rank_has_its_application_uri() {
         let text = "spaces: [{id: 1}]\nserver: {redundant: [\"urn:cell:a\", \"urn:cell:b\"]}\n";
         let mapping = Mapping::from_yaml(text, "cell.yaml").mapping.unwrap();
@@ -164,5 +337,7 @@ mod tests {
         };
         assert_eq!((&uri(1)[..], &uri(2)[..]), ("urn:cell:a", "urn:cell:b"));
         assert_eq!(ranked(&mapping, None), mapping);
+        assert!(!is_member(mapping.server()));
+        assert!(is_member(ranked(&mapping, Rank::new(1)).server()));
     }
 }

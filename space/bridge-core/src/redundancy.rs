@@ -57,6 +57,18 @@ impl RedundantPeer {
         self.heartbeat.is_fit
     }
 
+    /// Returns the ServiceLevel of an OPC UA server; `None` for a bridge.
+    #[must_use]
+    pub const fn service_level(&self) -> Option<u8> {
+        self.heartbeat.service_level
+    }
+
+    /// Returns whether the last heartbeat is so recent that the peer takes part in a takeover.
+    #[must_use]
+    pub fn is_present(&self, now: Instant) -> bool {
+        self.age(now) < PRESENT
+    }
+
     /// Returns the address.
     #[must_use]
     pub const fn from(&self) -> SocketAddr {
@@ -67,10 +79,6 @@ impl RedundantPeer {
     #[must_use]
     pub fn age(&self, now: Instant) -> Duration {
         now.saturating_duration_since(self.heard)
-    }
-
-    fn is_present(&self, now: Instant) -> bool {
-        self.age(now) < PRESENT
     }
 }
 
@@ -104,6 +112,8 @@ pub struct Redundancy {
     role: Role,
     epoch: u32,
     is_fit: bool,
+    /// The ServiceLevel of this OPC UA server.
+    service_level: Option<u8>,
     /// The number of heartbeats with a ROS side out of reach.
     unfit: u32,
     /// Whether this bridge has handed over and no other bridge was active since.
@@ -141,6 +151,7 @@ impl Redundancy {
             role: Role::Starting,
             epoch: 0,
             is_fit: true,
+            service_level: None,
             unfit: 0,
             is_released: false,
             is_cut: false,
@@ -265,6 +276,11 @@ impl Redundancy {
         self.is_fit = is_fit;
     }
 
+    /// Sets the ServiceLevel of this OPC UA server, which its heartbeats carry.
+    pub const fn set_service_level(&mut self, level: Option<u8>) {
+        self.service_level = level;
+    }
+
     /// Checks the lease. Call it before each message that is sent: an active bridge that did not
     /// run, or with a clock that jumped, is muted.
     pub fn check(&mut self, now: Now) -> Option<RoleChange> {
@@ -331,6 +347,7 @@ impl Redundancy {
             instance: self.instance,
             is_fit: self.is_fit,
             is_released: self.is_released,
+            service_level: self.service_level,
         }
     }
 

@@ -159,6 +159,11 @@ pub trait Port: Send + 'static {
         None
     }
 
+    /// Returns the ServiceLevel of an OPC UA server among redundant servers, which the others show.
+    fn service_level(&self) -> Option<u8> {
+        None
+    }
+
     /// Adds the peers of this side that the mapping needs and that are missing, such as a topic
     /// without a publisher. Called by the run loop each second.
     fn add_awaited(&self, missing: &mut AwaitedPeers) {

@@ -76,7 +76,11 @@ pub(crate) fn check(flags: &Flags, mapping: &Mapping, spaces: &[SpaceId]) -> Res
         None => mapping.pubsub().broker.is_some(),
     };
     if flags.address.is_none() && !mapping.pubsub().carriers.is_empty() {
-        return refuse("redundant bridges need one carrier, UDP multicast; list no other");
+        return refuse(
+            "redundant bridges need one carrier, UDP multicast, and `pubsub` is a list: the lease of the active \
+             bridge does not hold on several networks. Make `pubsub` a map with the group only, and let a program \
+             without --rank forward states to the other carriers",
+        );
     }
     if is_broker {
         return refuse("redundant bridges need UDP multicast, and the group is an MQTT broker");
@@ -163,6 +167,9 @@ calls:
             assert!(why.contains(said), "{why}");
         };
         refused(&["--dry-run"], VALUES, "--dry-run");
+        let carriers = "pubsub: [{udp: {}}, {mqtt: {address: mqtt://broker.local:1883}}]";
+        let several = format!("{carriers}{VALUES}");
+        refused(&[], &several, "a program without --rank forward");
         refused(
             &["--address", "mqtt://broker.local:1883"],
             VALUES,

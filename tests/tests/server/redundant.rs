@@ -10,19 +10,23 @@ spaces: [{id: 2}]
 variables:
   - {node: ns=2;i=10, name: temperature, type: Double, origin: 2}
   - {node: ns=2;i=30, name: setpoint, type: Double, origin: 0}
-server: {security: [None], redundant: [\"urn:cell:server-1\", \"urn:cell:server-2\"]}
+server:
+  security: [None]
+  redundant: [\"urn:cell:server-1\", \"urn:cell:server-2\"]
 ";
 const ENDPOINTS: [&str; 2] = [SERVER_ENDPOINT, "opc.tcp://127.0.0.1:48499"];
 const METRICS: [&str; 2] = [METRICS_SERVER, "127.0.0.1:9113"];
 const SERVICE_LEVEL: &str = "i=2267";
 const REDUNDANCY_SUPPORT: &str = "i=3709";
+const SERVER_REDUNDANCY: &str = "i=2296";
+const REDUNDANT_SERVER_ARRAY: &str = "i=11313";
 const SERVER_URI_ARRAY: &str = "i=11314";
 const SETPOINT: &str = "ns=2;i=30";
 
 fn start(cell: &Cell, at: usize, mapping: &str) -> Child {
     let rank = ["1", "2"][at];
     Started::new("ua-server", &program("ua-server"))
-        .args([mapping, "--rank", rank, "--endpoint", ENDPOINTS[at]])
+        .args([mapping, "--rank", rank])
         .args(["--pki".into(), cell.folder().join(format!("pki{rank}"))])
         .args(["--interface", "lo", "--metrics", METRICS[at]])
         .start()
@@ -31,6 +35,18 @@ fn start(cell: &Cell, at: usize, mapping: &str) -> Child {
 fn value(cell: &Cell, at: usize, node: &str) -> Option<Value> {
     let read = cell.asyncua_try("opcua_read.py", &[ENDPOINTS[at], node])?;
     Some(read.first()?["value"].clone())
+}
+
+/// Returns the ServiceLevels that a server shows of all servers; `None` while it shows others.
+fn levels_at(cell: &Cell, at: usize) -> Option<[u8; 2]> {
+    let servers = value(cell, at, REDUNDANT_SERVER_ARRAY)?;
+    let level = |of: usize| {
+        let shown = servers[of].as_str()?;
+        assert!(shown.contains(&format!("'urn:cell:server-{}'", of + 1)));
+        let (_, level) = shown.split_once("ServiceLevel=")?;
+        level.split(',').next()?.parse::<u8>().ok()
+    };
+    Some([level(0)?, level(1)?])
 }
 
 fn role(at: usize) -> Option<Value> {
@@ -56,7 +72,8 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
-    let mapping = cell.file("redundant.yaml", MAPPING);
+    let endpoints = format!("  redundant_endpoints: {ENDPOINTS:?}\n");
+    let mapping = cell.file("redundant.yaml", &format!("{MAPPING}{endpoints}"));
     let mapping = mapping.to_str().unwrap();
     let mut servers = [
         Some(start(&cell, 0, mapping)),
@@ -74,12 +91,19 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
         );
         let own = value(&cell, at, "i=2254").unwrap();
         assert_eq!(own[0], format!("urn:cell:server-{}", at + 1));
+        let args = [ENDPOINTS[at], SERVER_REDUNDANCY, "--children"];
+        let below = cell.asyncua_once("opcua_read.py", &args).remove(0);
+        let names = below["names"].as_array().unwrap();
+        assert!(names.contains(&json!("ServerUriArray")), "{below}");
     }
     // The roles may change at any time on a busy machine.
     eventually("the levels show the roles", SOON * 2, || {
         let active = settled();
         let levels = [active, 1 - active].map(|at| value(&cell, at, SERVICE_LEVEL));
-        (levels == [Some(json!(255)), Some(json!(199))]).then_some(())
+        let is_shown = levels == [Some(json!(255)), Some(json!(199))];
+        let of_all = [[255, 199], [199, 255]][active];
+        let is_known = (0..2).all(|at| levels_at(&cell, at) == Some(of_all));
+        (is_shown && is_known).then_some(())
     });
     // Both show the values of the space.
     let group = UadpSocket::join();
@@ -101,6 +125,9 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
     ended.wait_for_end(SOON);
     eventually("the standby is active", SOON, || {
         (role(standby)? == "active").then_some(())
+    });
+    eventually("it shows that the other server is lost", SOON, || {
+        (levels_at(&cell, standby)?[active] == 0).then_some(())
     });
     let mut sequence = 1;
     eventually("its level shows it", SOON, || {

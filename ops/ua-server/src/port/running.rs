@@ -3,10 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Failure, Rank};
+use bridge_node::{Failure, Rank, Router};
 use discovery::Announced;
 use mappings::{Mapping, Server};
 use opcua::server::{ServerHandle, SubscriptionCache};
+use opcua::types::{AttributeId, DataValue, NodeId, VariableId};
 use plant_opcua::configuration::Configuration;
 use plant_opcua::own;
 use plant_opcua::pki::Pki;
@@ -19,7 +20,7 @@ use tracing::warn;
 use crate::access;
 use crate::layout::Layout;
 use crate::nodesets;
-use crate::redundant::{Condition, ServerRole};
+use crate::redundant::{Condition, ServerRole, ServerSet};
 use crate::sks::Sks;
 
 /// The running server.
@@ -33,6 +34,7 @@ pub(super) struct RunningServer {
     rights: Rights,
     rank: Option<Rank>,
     role: ServerRole,
+    set: ServerSet,
     /// The interval of checking refused certificates and the users.
     look: Interval,
     /// Announces the server. Taken at shutdown.
@@ -61,7 +63,7 @@ impl RunningServer {
         handle: ServerHandle,
         (runtime, serving): (Runtime, JoinHandle<Result<(), String>>),
         (described, rights): (DescribedServer, Rights),
-        (rank, role): (Option<Rank>, ServerRole),
+        (rank, role, set): (Option<Rank>, ServerRole, ServerSet),
         told: Option<Announced>,
     ) -> Self {
         let mut look = tokio::time::interval(LOOK_AT_REJECTED);
@@ -74,6 +76,7 @@ impl RunningServer {
             rights,
             rank,
             role,
+            set,
             look,
             told,
         }
@@ -119,7 +122,29 @@ impl RunningServer {
             topics,
             silent,
         };
-        self.handle.set_service_level(condition.service_level());
+        let level = condition.service_level();
+        self.handle.set_service_level(level);
+        self.set.set_own(level);
+    }
+
+    /// Returns the ServiceLevel, for servers with redundancy.
+    pub(super) fn service_level(&self) -> Option<u8> {
+        self.set.own()
+    }
+
+    /// Shows the other servers of the redundant set.
+    pub(super) fn show_set(&self, router: &Router) {
+        let Some(redundancy) = router.redundancy() else {
+            return;
+        };
+        self.set.follow(redundancy, bridge_node::now().monotonic);
+        let Some(value) = self.set.take_change() else {
+            return;
+        };
+        let node: NodeId = VariableId::Server_ServerRedundancy_RedundantServerArray.into();
+        let change = (DataValue::new_now(value), &node, AttributeId::Value);
+        let subscriptions = self.handle.subscriptions();
+        subscriptions.notify_data_change(std::iter::once(change));
     }
 
     /// Waits for the end of the server, and returns its reason. Meanwhile, the refused certificates
@@ -148,6 +173,10 @@ impl RunningServer {
                 was.application_uri != is.application_uri,
             ),
             ("server.redundant", was.redundant != is.redundant),
+            (
+                "server.redundant_endpoints",
+                was.redundant_endpoints != is.redundant_endpoints,
+            ),
             ("server.security", was.security != is.security),
             ("server.limits", was.limits != is.limits),
             (

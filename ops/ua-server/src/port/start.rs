@@ -3,7 +3,7 @@
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 
-use bridge_node::{Application, Failure, FailureKind, Rank};
+use bridge_node::{Application, Failure, FailureKind};
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
 use mappings::{Anonymous, Mapping, Role, Server};
 use opcua::nodes::NodeType;
@@ -37,7 +37,7 @@ use crate::methods::Methods;
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::nodesets;
 use crate::pubsub::{Places, PubSub};
-use crate::redundant::{self, ServerRole};
+use crate::redundant::{self, ServerRole, ServerSet};
 use crate::sks::Sks;
 use crate::structures::Types;
 
@@ -127,7 +127,7 @@ pub(super) fn audit(access: &Access, handle: &ServerHandle) {
 pub(super) fn core(
     (sks, pubsub, alarms): (&Arc<Sks>, &Arc<PubSub>, &Arc<Alarms>),
     (configuration, is_announced): (&Arc<Configuration>, bool),
-    (described, facets, rank): (&Server, Facets, Option<Rank>),
+    (described, facets, set): (&Server, Facets, &ServerSet),
     access: &Arc<Access>,
 ) -> impl NodeManagerBuilder + use<> {
     let methods = [
@@ -146,12 +146,18 @@ pub(super) fn core(
     let values = values.into_iter();
     let mut values: Vec<(VariableId, CoreValue)> =
         values.map(|(id, value)| (id, value.into())).collect();
-    values.extend(redundant::values(described, rank));
+    values.extend(redundant::values(described, set));
     values.extend(capabilities(&endpoint::within(described.limits), facets));
     values.extend(roles::values(access));
     let supplement = Supplement::new(values, Some(Arc::clone(access)));
     let supplement = supplement.with_events(Arc::clone(alarms) as Arc<dyn EventHistory>);
-    core_with(methods, supplement, prepared)
+    let is_redundant = set.own().is_some();
+    core_with(methods, supplement, move |core| {
+        prepared(core);
+        if is_redundant {
+            redundant::prepare(core);
+        }
+    })
 }
 
 /// Lists the aggregates and the roles, and sets the Auditing variable and the EventNotifier of the
@@ -308,12 +314,14 @@ pub(super) fn told_of(
     url: String,
     security: &[Security],
 ) -> (discovery::Server, Application) {
+    let redundancy = redundant::is_member(described).then_some("NTRS");
+    let capabilities = ["DA", "HD"].into_iter().chain(redundancy);
     let server = discovery::Server {
         application_uri: described.application_uri.clone(),
         product_uri: endpoint::PRODUCT_URI.to_owned(),
         name: "ua-server".to_owned(),
         url,
-        capabilities: ["DA", "HD"].map(str::to_owned).to_vec(),
+        capabilities: capabilities.map(str::to_owned).collect(),
         number: None,
     };
     let application = application(&server, security);

@@ -22,6 +22,8 @@ pub struct Heartbeat {
     pub(super) instance: u32,
     pub(super) is_fit: bool,
     pub(super) is_released: bool,
+    /// The ServiceLevel of an OPC UA server; `None` for a bridge.
+    pub(super) service_level: Option<u8>,
 }
 
 impl Heartbeat {
@@ -47,6 +49,10 @@ impl Heartbeat {
         frame.scalar(Scalar::Byte(flags))?;
         frame.scalar(Scalar::UInt32(self.epoch))?;
         frame.scalar(Scalar::UInt32(self.instance))?;
+        // Readers ignore further fields, so that programs of different versions know each other.
+        if let Some(level) = self.service_level {
+            frame.scalar(Scalar::Byte(level))?;
+        }
         frame.finish()?;
         message.finish()
     }
@@ -90,6 +96,12 @@ impl Heartbeat {
         let Scalar::UInt32(instance) = next()? else {
             return None;
         };
+        let level = fields.next().transpose().ok()?;
+        let service_level = if let Some(Variant::Scalar(Scalar::Byte(level))) = level {
+            Some(level)
+        } else {
+            None
+        };
         let heartbeat = Self {
             rank: Rank::new(rank)?,
             role: Role::of(role)?,
@@ -97,6 +109,7 @@ impl Heartbeat {
             instance,
             is_fit: flags & 1 != 0,
             is_released: flags & 2 != 0,
+            service_level,
         };
         Some((SpaceId::new(space)?, heartbeat))
     }

@@ -402,21 +402,41 @@ fn a_standby_that_is_cut_off_does_not_take_over_and_an_active_bridge_listens_whe
 fn a_heartbeat_is_read_as_it_was_written_and_nothing_else_is_one() {
     let now = start();
     let state = Redundancy::new(Rank::new(2).unwrap(), 77, now);
-    let heartbeat = Heartbeat {
-        epoch: 7,
-        is_released: true,
-        ..state.heartbeat()
-    };
     let space = SpaceId::new(3).unwrap();
-    let mut bytes = Vec::new();
-    heartbeat.encode(space, now.utc, &mut bytes).unwrap();
-    let message = NetworkMessage::decode(&bytes).unwrap();
-    assert_eq!(Heartbeat::decode(&message), Some((space, heartbeat)));
-    for length in 0..bytes.len() {
-        if let Ok(message) = NetworkMessage::decode(&bytes[..length]) {
-            assert_eq!(Heartbeat::decode(&message), None, "{length} bytes");
+    // The heartbeat of a bridge, and that of an OPC UA server.
+    for service_level in [None, Some(199)] {
+        let heartbeat = Heartbeat {
+            epoch: 7,
+            is_released: true,
+            service_level,
+            ..state.heartbeat()
+        };
+        let mut bytes = Vec::new();
+        heartbeat.encode(space, now.utc, &mut bytes).unwrap();
+        let message = NetworkMessage::decode(&bytes).unwrap();
+        assert_eq!(Heartbeat::decode(&message), Some((space, heartbeat)));
+        for length in 0..bytes.len() {
+            if let Ok(message) = NetworkMessage::decode(&bytes[..length]) {
+                assert_eq!(Heartbeat::decode(&message), None, "{length} bytes");
+            }
         }
     }
+}
+
+#[test]
+fn the_service_level_of_a_server_is_known_to_the_others() {
+    let now = start();
+    let mut server = Redundancy::new(Rank::new(1).unwrap(), 1, now);
+    let mut other = Redundancy::new(Rank::new(2).unwrap(), 2, now);
+    server.set_service_level(Some(199));
+    let _change = other.hear(server.heartbeat(), address(1), now);
+    let level = |at: Instant| {
+        let mut present = other.peers(at).filter(|peer| peer.is_present(at));
+        let server = present.next()?;
+        Some((server.rank().get(), server.service_level()))
+    };
+    assert_eq!(level(now.monotonic), Some((1, Some(199))));
+    assert_eq!(level(now.monotonic + PRESENT), None);
 }
 
 #[test]
@@ -434,6 +454,7 @@ fn a_takeover_waits_for_messages_that_have_arrived_but_not_for_ever() {
         instance: 1,
         is_fit: true,
         is_released: false,
+        service_level: None,
     };
     let step = |state: &mut Redundancy, ms: u64, waits: bool| {
         let _none = state.check(at(ms));

@@ -86,6 +86,13 @@ impl Router {
         }
     }
 
+    /// Sets the ServiceLevel of this OPC UA server, for the other servers of its redundant set.
+    pub fn set_service_level(&mut self, level: Option<u8>) {
+        if let Some(redundant) = &mut self.values.redundant {
+            redundant.set_service_level(level);
+        }
+    }
+
     /// Hands over to a standby.
     ///
     /// # Errors

@@ -107,6 +107,11 @@ impl Redundant {
         self.state.set_fit(is_fit);
     }
 
+    /// Sets the ServiceLevel of this OPC UA server.
+    pub(super) const fn set_service_level(&mut self, level: Option<u8>) {
+        self.state.set_service_level(level);
+    }
+
     /// Checks the lease.
     pub(super) fn check(&mut self, now: Now) -> Option<RoleChange> {
         self.state.check(now)

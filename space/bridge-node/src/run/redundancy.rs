@@ -44,6 +44,7 @@ impl<P: Port> Shell<P> {
                 self.port.role_changed(true);
                 self.offer_calls_of_others(true);
                 tell_active(rank, (cause, epoch, gap));
+                self.router.set_service_level(self.port.service_level());
             }
             RoleChange::Follows { rank: other, from } => tell_standby(rank, (other, from)),
             RoleChange::Muted { cause } => {
@@ -54,6 +55,7 @@ impl<P: Port> Shell<P> {
                     self.offer_calls_of_others(false);
                 }
                 tell_muted(rank, cause);
+                self.router.set_service_level(self.port.service_level());
             }
             RoleChange::Rival { rank: other, from } => tell_rival(rank, (other, from)),
             RoleChange::SameRank { from } => tell_same_rank(rank, from),
@@ -94,6 +96,7 @@ impl<P: Port> Shell<P> {
             .is_none_or(|held| Held::lost(held).is_none());
         let is_fit = is_held && self.port.hindrance().is_none();
         self.router.set_fit(is_fit);
+        self.router.set_service_level(self.port.service_level());
     }
 
     /// Returns the reasons for which the redundancy does not work.
