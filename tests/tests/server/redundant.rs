@@ -95,6 +95,19 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
         let below = cell.asyncua_once("opcua_read.py", &args).remove(0);
         let names = below["names"].as_array().unwrap();
         assert!(names.contains(&json!("ServerUriArray")), "{below}");
+        // A client of one server finds the endpoints of all of them.
+        let args = ["find-servers", ENDPOINTS[at]];
+        let found = cell.asyncua_once("opcua_discovery.py", &args).remove(0);
+        let found = found["registered"].as_array().unwrap();
+        let found = found.iter().map(|server| (&server["uri"], &server["urls"]));
+        let mut found: Vec<_> = found.collect();
+        found.sort_by_key(|(uri, _)| uri.as_str());
+        let server = |of: usize| {
+            let uri = json!(format!("urn:cell:server-{}", of + 1));
+            (uri, json!([ENDPOINTS[of]]))
+        };
+        let all = [server(0), server(1)];
+        assert_eq!(found, all.each_ref().map(|(uri, urls)| (uri, urls)));
     }
     // The roles may change at any time on a busy machine.
     eventually("the levels show the roles", SOON * 2, || {
