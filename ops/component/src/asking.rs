@@ -76,6 +76,11 @@ impl Asking {
         }
     }
 
+    /// Returns the calls that drivers need.
+    pub(crate) fn wanted(&self) -> impl Iterator<Item = TopicId> {
+        self.wanted.iter().copied()
+    }
+
     /// Waits for the next event to report. Cancel-safe.
     pub(crate) async fn next(&mut self) -> PortEvent {
         loop {

@@ -262,6 +262,12 @@ impl Port for ComponentPort {
         Some(self.application.clone())
     }
 
+    /// Returns the topics of values and the calls of skills that the component takes from others.
+    fn used_topics(&self) -> Option<Vec<TopicId>> {
+        let topics = self.topics.all().chain(self.asking.wanted());
+        Some(topics.collect())
+    }
+
     /// Takes the values that the component shows. Other values do not count as losses.
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
         self.topics.received(&sample);

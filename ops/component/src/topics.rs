@@ -37,6 +37,11 @@ impl Topics {
         }
     }
 
+    /// Returns the topics.
+    pub(crate) fn all(&self) -> impl Iterator<Item = TopicId> {
+        self.0.keys().copied()
+    }
+
     /// Takes a message of another participant.
     pub(crate) fn received(&self, sample: &Delivery) {
         let Some(fields) = self.0.get(&sample.topic) else {

@@ -19,6 +19,7 @@ mod by_name;
 mod call;
 mod call_announcement;
 mod call_plan;
+mod concern;
 mod confirm;
 mod constant;
 mod counters;

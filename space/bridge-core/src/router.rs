@@ -72,7 +72,8 @@ use crate::tap::{Crossing, Tapped};
 ///   [`handle_datagram`](Self::handle_datagram), [`handle_received`](Self::handle_received).
 /// - types and metadata: [`bind`](Self::bind), [`bind_as`](Self::bind_as),
 ///   [`unbind`](Self::unbind), [`describe_value`](Self::describe_value),
-///   [`introduce`](Self::introduce), [`call_the_roll`](Self::call_the_roll).
+///   [`introduce`](Self::introduce), [`call_the_roll`](Self::call_the_roll),
+///   [`limit_to`](Self::limit_to).
 /// - calls: [`bind_call`](Self::bind_call), [`unbind_call`](Self::unbind_call),
 ///   [`want_call`](Self::want_call), [`ask`](Self::ask), [`give_up`](Self::give_up),
 ///   [`offer`](Self::offer), [`offer_type`](Self::offer_type), [`withdraw`](Self::withdraw),

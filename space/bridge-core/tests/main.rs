@@ -29,6 +29,7 @@ mod events;
 mod fields;
 mod foreign;
 mod large;
+mod limited;
 mod loop_freedom;
 mod many;
 mod metadata;

@@ -197,6 +197,13 @@ pub trait Port: Send + 'static {
         None
     }
 
+    /// Returns the topics and calls of other programs that this side uses when it starts. Values,
+    /// descriptions and calls of other namespaces are then dropped by their headers, except for
+    /// calls that are wanted later ([`PortEvent::CallWanted`]). `None` if it may use any of them.
+    fn used_topics(&self) -> Option<Vec<TopicId>> {
+        None
+    }
+
     /// Returns the addresses of this host that this side has used since its start and cannot
     /// change; an empty list stands for all addresses. `None` if its library follows changes.
     fn addresses(&self) -> Option<&[IpAddr]> {

@@ -349,7 +349,6 @@ async fn prepare<P: Program>(
     let mapping = keys.applied(Arc::clone(&taken));
     let mut router = router_of(program, settings, &mapping, carrier.as_ref())?;
     keys.start(&mapping, &mut router)?;
-    router.call_the_roll(now());
     let context = Context {
         mapping: Arc::clone(&mapping),
         types,
@@ -360,6 +359,7 @@ async fn prepare<P: Program>(
         observer.mapped(&taken);
     }
     let port = program.start(context).await?;
+    look_around(&mut router, &port);
     let application = port.application().unwrap_or_else(|| plain(P::NAME, own));
     let told = group.and_then(|options| {
         program.tell(&Carried {
@@ -405,6 +405,14 @@ async fn prepare<P: Program>(
         observer,
         _told: told,
     })
+}
+
+/// Limits the Router to the topics that the port uses, and probes for the calls of other programs.
+fn look_around(router: &mut Router, port: &impl Port) {
+    if let Some(topics) = port.used_topics() {
+        router.limit_to(topics);
+    }
+    router.call_the_roll(now());
 }
 
 /// Returns the Router of a space, which has no keys yet.

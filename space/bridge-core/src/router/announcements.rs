@@ -16,6 +16,7 @@ use uadp::discovery::{
 
 use self::applications::Applications;
 use self::probes::MetadataProbes;
+pub(super) use self::rolls::Asked;
 use self::rolls::Rolls;
 use super::about::About;
 use super::values::Values;
@@ -146,10 +147,10 @@ impl Announcements {
         self.reckon();
     }
 
-    /// Probes a space for its calls.
-    pub(super) fn probe_calls(&mut self, space: SpaceId, now: Now) {
+    /// Probes a space or one of its namespaces for its calls.
+    pub(super) fn probe_calls(&mut self, asked: Asked, now: Now) {
         let at = self.at(now);
-        self.rolls.plan(space, at);
+        self.rolls.plan(asked, at);
         self.reckon();
     }
 
@@ -187,8 +188,8 @@ impl Announcements {
         self.reckon();
     }
 
-    /// Handles a probe of another program for the calls of a space.
-    pub(super) fn handle_roll(&mut self, asked: SpaceId, now: Now) {
+    /// Handles a probe of another program for the calls of a space or of a namespace.
+    pub(super) fn handle_roll(&mut self, asked: Asked, now: Now) {
         let since = self.since_start(now);
         self.rolls.handle_probe(asked, since);
         self.reckon();
@@ -235,7 +236,7 @@ impl Announcements {
     /// Completes the probes for a call that is known.
     pub(super) fn call_known(&mut self, topic: TopicId) {
         self.probes.answered(topic.space, |other| other == topic);
-        self.rolls.handle_answer(topic.space);
+        self.rolls.handle_answer(topic);
         self.reckon();
     }
 
@@ -416,8 +417,8 @@ impl Announcements {
             let probe = Probe::DataSetMetaData(List::new(&ids));
             values.send_probe(&probe, Some(space));
         }
-        for space in self.rolls.poll(at) {
-            values.send_probe(&WRITERS, Some(space));
+        for asked in self.rolls.poll(at) {
+            values.send_probe(&asked.probe(), Some(asked.publisher()));
         }
         if self.applications.poll(at) {
             values.send_probe(&Probe::FindApplications, None);
@@ -445,10 +446,3 @@ impl Announcements {
         }
     }
 }
-
-/// The probe for the PubSubConnections of a space, which is also the probe for its calls.
-pub(super) const WRITERS: Probe<'static> = Probe::PubSubConnections {
-    transport_profile_uris: List::null(),
-    include_writer_groups: false,
-    include_data_set_writers: false,
-};

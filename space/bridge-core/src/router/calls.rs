@@ -295,6 +295,7 @@ impl CallTraffic<'_> {
     /// Records that the local side has a client for a call. If the call is not known, its executor
     /// is probed.
     pub(super) fn want_call(&mut self, topic: TopicId, now: Now) {
+        self.values.concern.add(topic);
         if self.described_call(topic).is_none() && !self.values.is_home(topic) {
             self.announcements.probe(topic, now);
         }

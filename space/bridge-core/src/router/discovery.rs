@@ -8,6 +8,7 @@ use messages::{MessageType, Selection};
 use uadp::discovery::{Announced, Announcement, DataSetMetaDataType, Probe};
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId, StatusCode};
 
+use super::announcements::Asked;
 use super::receive::DISCOVERY;
 use super::values::Values;
 use super::{About, Router};
@@ -49,16 +50,34 @@ impl Router {
         self.describe(topic, None, now);
     }
 
+    /// Limits this program to the namespaces of these topics and of the [wanted](Self::want_call)
+    /// calls. Values, descriptions and calls of other namespaces are neither decoded nor stored nor
+    /// counted. The namespaces of the own space stay under observation for other writers.
+    pub fn limit_to(&mut self, topics: impl IntoIterator<Item = TopicId>) {
+        self.values.concern.limit();
+        for topic in topics {
+            self.values.concern.add(topic);
+        }
+    }
+
     /// Probes the spaces of the mapping and the default spaces for their calls when the program
-    /// starts. Otherwise the calls would be known only after their next periodic announcement.
+    /// starts. Otherwise the calls would be known only after their next periodic announcement. A
+    /// [limited](Self::limit_to) program probes its namespaces only.
     pub fn call_the_roll(&mut self, now: Now) {
+        if let Some(namespaces) = self.values.concern.namespaces() {
+            for (space, namespace) in namespaces {
+                let asked = Asked::namespace(*space, *namespace);
+                self.announcements.probe_calls(asked, now);
+            }
+            return;
+        }
         let own = self.values.settings.own;
         let declared = self.values.mapping.spaces().iter().map(|space| space.id);
         let usual = [0, 1, 2].into_iter().filter_map(SpaceId::new);
         let spaces: BTreeSet<SpaceId> = declared.chain(usual).collect();
         for space in spaces {
             if space != own || own == SpaceId::UA {
-                self.announcements.probe_calls(space, now);
+                self.announcements.probe_calls(Asked::space(space), now);
             }
         }
     }
@@ -166,9 +185,22 @@ impl Router {
             Ok(Probe::PubSubConnections { .. }) if self.values.is_source(from) => {}
             Ok(Probe::PubSubConnections { .. }) => {
                 // It is also used as a probe for calls.
-                self.announcements.handle_roll(space, now);
+                self.announcements.handle_roll(Asked::space(space), now);
                 if space == own {
                     self.call_traffic().announce_calls(now);
+                }
+            }
+            Ok(Probe::WriterGroupConfiguration {
+                writer_group_id: namespace,
+                include_data_set_writers: false,
+            }) => {
+                // Own probes are received, too.
+                if !self.values.is_source(from) {
+                    let asked = Asked::namespace(space, namespace);
+                    self.announcements.handle_roll(asked, now);
+                    if space == own {
+                        self.call_traffic().announce_calls_of(namespace, now);
+                    }
                 }
             }
             Ok(probe @ (Probe::PublisherEndpoints | Probe::FindApplications)) => {
@@ -242,6 +274,8 @@ impl Router {
         }
         let bad = status.0 & STATUS_BAD != 0;
         match topic {
+            // This program uses no values of the namespace.
+            Some(topic) if !self.values.concern.has_topic(topic) => {}
             Some(topic) if bad => {
                 self.values.unlearn(topic, from, now);
                 let mut calls = self.call_traffic();

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 
 use mappings::TopicId;
 
-use super::announcements::WRITERS;
+use super::announcements::Asked;
 use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::loop_rule::{Owned, Side, What, may_cross};
@@ -47,10 +47,14 @@ impl Router {
         let Owned::Only(namespaces) = &self.values.owned else {
             return;
         };
-        let namespaces = namespaces.iter().copied();
-        self.values.claims.claim(namespaces, now.monotonic);
+        let namespaces: Vec<u16> = namespaces.iter().copied().collect();
         let own = self.values.settings.own;
-        self.values.send_probe(&WRITERS, Some(own));
+        for namespace in &namespaces {
+            // The programs of other namespaces do not respond: there may be hundreds of them.
+            let asked = Asked::namespace(own, *namespace);
+            self.values.send_probe(&asked.probe(), Some(own));
+        }
+        self.values.claims.claim(namespaces, now.monotonic);
     }
 
     /// Starts to send in free namespaces.

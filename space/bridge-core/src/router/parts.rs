@@ -4,6 +4,7 @@
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 
+use mappings::SpaceId;
 use uadp::NetworkMessage;
 
 use super::{About, Router, Values};
@@ -116,5 +117,17 @@ impl Values {
         self.part
             .as_ref()
             .is_none_or(|part| part.has(namespace) && !self.claims.withholds(namespace))
+    }
+
+    /// Returns whether received values of the namespace are dropped unread: another bridge of the
+    /// space delivers them, or this program does not use them. Values in own namespaces show other
+    /// writers, and tapped topics show what arrives.
+    pub(super) fn is_unused(&self, space: SpaceId, namespace: u16) -> bool {
+        let is_used = || {
+            self.tap.is_on()
+                || self.concern.has(space, namespace)
+                || self.is_ours(space, Some(namespace))
+        };
+        !self.carries(namespace) || !is_used()
     }
 }

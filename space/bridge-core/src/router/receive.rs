@@ -100,10 +100,7 @@ impl Router {
             return;
         }
         let namespace = header.group.and_then(|group| group.writer_group_id);
-        if self.values.part.is_some()
-            && namespace.is_some_and(|namespace| !self.values.carries(namespace))
-        {
-            // Another bridge of the space delivers it.
+        if namespace.is_some_and(|namespace| self.values.is_unused(space, namespace)) {
             return;
         }
         if self.values.is_ours(space, namespace) {
@@ -210,7 +207,7 @@ impl Values {
 
     /// Returns whether only this program writes messages of the group. A message without a group
     /// counts as own only if this program owns the whole space.
-    fn is_ours(&self, space: SpaceId, namespace: Option<u16>) -> bool {
+    pub(super) fn is_ours(&self, space: SpaceId, namespace: Option<u16>) -> bool {
         let home = namespace.map_or(self.owned == Owned::All, |namespace| {
             self.owned.has(namespace)
         });
@@ -278,6 +275,9 @@ impl Values {
     ) {
         let about = About::message(topic, from);
         self.note_received(topic, message, from);
+        if !self.concern.has_topic(topic) {
+            return;
+        }
         if !message.is_valid() {
             return self.count(about, Reason::Invalid, 1, || {
                 "the writer marked its DataSetMessage as invalid".to_owned()

@@ -14,6 +14,7 @@ use super::claims::Claims;
 use super::inquiries::Inquiries;
 use super::redundant::Redundant;
 use crate::buffers::Buffers;
+use crate::concern::Concern;
 use crate::confirm::Confirmer;
 use crate::counters::Reason;
 use crate::description::Described;
@@ -53,6 +54,8 @@ pub(super) struct Values {
     pub(super) claims: Claims,
     /// The redundancy of the own space; `None` without redundancy.
     pub(super) redundant: Option<Box<Redundant>>,
+    /// The namespaces of other programs that this program uses.
+    pub(super) concern: Concern,
     /// The namespaces that this program carries; `None` for all of them.
     pub(super) part: Option<Box<OwnPart>>,
     /// The broker between the programs; `None` for a network that does not store messages.
@@ -107,6 +110,7 @@ impl Values {
             pace: Pace::default(),
             claims: Claims::default(),
             redundant: None,
+            concern: Concern::default(),
             part: None,
             relay: None,
             limit: None,

@@ -4,25 +4,80 @@ use std::collections::{BTreeMap, HashSet};
 use std::time::Duration;
 
 use mappings::{SpaceId, TopicId};
-use uadp::discovery::{ProbeLimits, ProbeStep, ProbeTimer};
+use uadp::discovery::{List, Probe, ProbeLimits, ProbeStep, ProbeTimer};
 
-/// The spaces that are probed for their calls.
+/// The calls that a probe asks for: those of a space, or of one of its namespaces. A cell may have
+/// hundreds of programs in space 0, so a probe for a single program names its namespace.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(in super::super) struct Asked {
+    space: SpaceId,
+    namespace: Option<u16>,
+}
+
+impl Asked {
+    /// Asks for all calls of a space.
+    pub(in super::super) const fn space(space: SpaceId) -> Self {
+        Self {
+            space,
+            namespace: None,
+        }
+    }
+
+    /// Asks for the calls of a namespace.
+    pub(in super::super) const fn namespace(space: SpaceId, namespace: u16) -> Self {
+        Self {
+            space,
+            namespace: Some(namespace),
+        }
+    }
+
+    /// Returns the space to which the probe is addressed.
+    pub(in super::super) const fn publisher(self) -> SpaceId {
+        self.space
+    }
+
+    /// Returns the probe: for the PubSubConnections of the space, or for the WriterGroup of the
+    /// namespace.
+    pub(in super::super) const fn probe(self) -> Probe<'static> {
+        match self.namespace {
+            None => Probe::PubSubConnections {
+                transport_profile_uris: List::null(),
+                include_writer_groups: false,
+                include_data_set_writers: false,
+            },
+            Some(writer_group_id) => Probe::WriterGroupConfiguration {
+                writer_group_id,
+                include_data_set_writers: false,
+            },
+        }
+    }
+
+    /// Returns whether the response to this probe is also a response to the other probe.
+    fn includes(self, other: Self) -> bool {
+        self.space == other.space && (self.namespace.is_none() || self == other)
+    }
+}
+
+/// The spaces and namespaces that are probed for their calls.
 #[derive(Debug, Default)]
 pub(super) struct Rolls {
-    timers: BTreeMap<SpaceId, ProbeTimer>,
+    timers: BTreeMap<Asked, ProbeTimer>,
     /// Namespaces with a program that was already probed for its calls.
     met: HashSet<(SpaceId, u16)>,
 }
 
 impl Rolls {
-    /// Plans a probe, unless a probe of the space is in progress.
-    pub(super) fn plan(&mut self, space: SpaceId, (since, random): (Duration, u32)) {
+    /// Plans a probe, unless a probe for these calls is in progress.
+    pub(super) fn plan(&mut self, asked: Asked, (since, random): (Duration, u32)) {
+        if self.timers.contains_key(&Asked::space(asked.space)) {
+            return;
+        }
         let limits = ProbeLimits {
             max_period: Duration::from_secs(1),
             attempts: 2,
         };
         self.timers
-            .entry(space)
+            .entry(asked)
             .or_insert_with(|| ProbeTimer::new(since, random, limits));
     }
 
@@ -30,21 +85,29 @@ impl Rolls {
     pub(super) fn meet(&mut self, topic: TopicId, at: (Duration, u32)) {
         let (_, namespace, _) = topic.triple();
         if self.met.len() < MAX_MET && self.met.insert((topic.space, namespace)) {
-            self.plan(topic.space, at);
+            self.plan(Asked::namespace(topic.space, namespace), at);
         }
     }
 
     /// Records the probe of another program. Its answer serves this program too.
-    pub(super) fn handle_probe(&mut self, space: SpaceId, since: Duration) {
-        if let Some(timer) = self.timers.get_mut(&space) {
-            timer.handle_probe(since);
+    pub(super) fn handle_probe(&mut self, other: Asked, since: Duration) {
+        for (asked, timer) in &mut self.timers {
+            if other.includes(*asked) {
+                timer.handle_probe(since);
+            }
         }
     }
 
-    /// Completes the probe of a space with a known call.
-    pub(super) fn handle_answer(&mut self, space: SpaceId) {
-        if let Some(timer) = self.timers.get_mut(&space) {
-            timer.handle_answer();
+    /// Completes the probes that a known call answers.
+    pub(super) fn handle_answer(&mut self, topic: TopicId) {
+        let (_, namespace, _) = topic.triple();
+        for asked in [
+            Asked::space(topic.space),
+            Asked::namespace(topic.space, namespace),
+        ] {
+            if let Some(timer) = self.timers.get_mut(&asked) {
+                timer.handle_answer();
+            }
         }
     }
 
@@ -53,14 +116,16 @@ impl Rolls {
         timers.filter_map(ProbeTimer::poll_timeout).min()
     }
 
-    /// Returns the spaces whose probes are due.
-    pub(super) fn poll(&mut self, (since, random): (Duration, u32)) -> Vec<SpaceId> {
+    /// Returns the probes that are due.
+    pub(super) fn poll(&mut self, (since, random): (Duration, u32)) -> Vec<Asked> {
         let mut due = Vec::new();
-        self.timers.retain(|space, timer| {
-            match timer.poll(since, random.rotate_left(space.get().into())) {
+        self.timers.retain(|asked, timer| {
+            let turn =
+                u32::from(asked.space.get()) + u32::from(asked.namespace.unwrap_or_default());
+            match timer.poll(since, random.rotate_left(turn % u32::BITS)) {
                 ProbeStep::Wait => true,
                 ProbeStep::Send => {
-                    due.push(*space);
+                    due.push(*asked);
                     true
                 }
                 ProbeStep::Answered | ProbeStep::GivenUp => false,

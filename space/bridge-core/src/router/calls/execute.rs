@@ -136,6 +136,14 @@ impl CallTraffic<'_> {
         }
     }
 
+    /// Announces the own calls of a namespace, in response to a probe for them.
+    pub(in super::super) fn announce_calls_of(&mut self, namespace: u16, now: Now) {
+        let calls = self.calls.iter().flat_map(|calls| calls.own());
+        for topic in calls.filter(|topic| topic.triple().1 == namespace) {
+            self.announcements.plan_call(topic, now);
+        }
+    }
+
     /// Handles a request, and passes it to the local side if it is for an own call and may be
     /// executed.
     pub(in super::super) fn handle_request(

@@ -111,6 +111,9 @@ impl CallTraffic<'_> {
         if self.values.is_home(topic) {
             return self.values.drop_own(Some(namespace), from, now);
         }
+        if !self.values.concern.has_topic(topic) {
+            return;
+        }
         if self
             .values
             .part
