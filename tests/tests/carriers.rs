@@ -1,4 +1,7 @@
-//! The carriers: each passes the same tests, UDP multicast, an MQTT broker, and both together.
+//! The carriers: each passes the same tests, UDP multicast, Ethernet, an MQTT broker, and UDP and
+//! MQTT together.
+
+mod ethernet;
 
 use std::process::Command;
 use std::sync::Arc;
@@ -270,8 +273,15 @@ async fn conforms(network: &mut dyn Network, Faults { loses, reorders }: Faults)
     }
     meet(b.as_mut(), 2, &mut [&mut a]).await;
 
-    // A large message arrives whole.
-    send(a.as_mut(), 1, 100, 60_000).unwrap();
+    // A large message arrives whole, and one that is too large is refused.
+    let overhead = value(1, 100, 0).len();
+    let limit = a.limit().filter(|limit| *limit < 60_000);
+    let largest = limit.unwrap_or(60_000) - overhead;
+    if limit.is_some() {
+        let too_large = send(a.as_mut(), 1, 100, largest + 1);
+        assert_eq!(too_large, Err(SendError::TooBig));
+    }
+    send(a.as_mut(), 1, 100, largest).unwrap();
     numbers(b.as_mut(), 1, 100).await;
 
     // A program that joins late gets nothing that was sent before.
