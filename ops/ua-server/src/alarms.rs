@@ -454,7 +454,7 @@ impl Alarms {
         self.delayed.notify_one();
         let topics: Vec<TopicId> = self.inner.lock().sources.keys().copied().collect();
         for topic in topics {
-            self.look(topic, || place.space.inner().shown(topic));
+            self.look(topic, || place.space.inner().live().shown(topic));
         }
     }
 

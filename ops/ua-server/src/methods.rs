@@ -158,7 +158,7 @@ impl Methods {
         };
         drop(address_space);
         let callable = Callable::new(topic, description);
-        let mut methods = self.manager.inner().methods().lock();
+        let mut methods = self.manager.inner().callables().methods().lock();
         methods.insert(node.clone(), callable);
         Some(around)
     }
@@ -206,7 +206,12 @@ impl Methods {
         let Some(node) = self.shown.remove(&topic) else {
             return;
         };
-        self.manager.inner().methods().lock().remove(&node);
+        self.manager
+            .inner()
+            .callables()
+            .methods()
+            .lock()
+            .remove(&node);
         let mut address_space = self.manager.address_space().write();
         let nodesets = self.manager.inner().nodesets();
         if !nodesets.let_call(&mut address_space, &node, false) {
@@ -238,7 +243,7 @@ impl Methods {
             .iter()
             .filter(|(topic, node)| self.node(**topic) != **node);
         let callable = |(topic, node): (&TopicId, &NodeId)| {
-            let methods = self.manager.inner().methods().lock();
+            let methods = self.manager.inner().callables().methods().lock();
             Some((*topic, Arc::clone(methods.get(node)?.description())))
         };
         let mut moved: Vec<_> = moved.filter_map(callable).collect();

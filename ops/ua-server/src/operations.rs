@@ -84,13 +84,13 @@ impl Operations for PageOperations {
         request: Bytes,
     ) -> BoxFuture<Result<Bytes, OperationFault>> {
         let found = {
-            let methods = self.manager.inner().methods().lock();
+            let methods = self.manager.inner().callables().methods().lock();
             let mut methods = methods.iter();
             let found = methods.find(|(_, callable)| callable.topic() == topic);
             found.map(|(node, callable)| (node.clone(), callable.clone()))
         };
         let access = Arc::clone(&self.access);
-        let questions = self.manager.inner().questions().clone();
+        let questions = self.manager.inner().callables().questions().clone();
         Box::pin(async move {
             let Some((node, callable)) = found else {
                 let why = format!("{topic} is no Method of this server");

@@ -438,7 +438,7 @@ impl Port for ServerPort {
     async fn shutdown(mut self) {
         self.methods.end();
         self.server.shutdown().await;
-        self.shown.manager().inner().close_past();
+        self.shown.manager().inner().live().close_past();
     }
 }
 

@@ -130,9 +130,9 @@ impl Programs {
         let run = Run::new((name, goal), nodes, calls, &self.unknown);
         let inner = self.manager.inner();
         let sends = goal_node(goal, inner);
-        let drive = |method| run.drive(method, inner.questions(), sends.clone());
+        let drive = |method| run.drive(method, inner.callables().questions(), sends.clone());
         let all = methods.map(|(node, method)| (node, drive(method)));
-        inner.programs().lock().extend(all);
+        inner.callables().programs().lock().extend(all);
         if let Some(feedback) = feedback {
             self.feedback.insert(feedback, goal);
         }
@@ -161,7 +161,7 @@ impl Programs {
         }
         shown.run.leave(run::GONE);
         let nodes = shown.run.nodes();
-        let mut programs = self.manager.inner().programs().lock();
+        let mut programs = self.manager.inner().callables().programs().lock();
         for (method, _) in nodes.methods() {
             programs.remove(&method);
         }
@@ -199,7 +199,7 @@ impl Programs {
 /// Returns the node of the Method that sends goals. Clients with permission to call the Method may
 /// control the Program.
 fn goal_node(goal: TopicId, nodes: &crate::nodes::SpaceNodes) -> NodeId {
-    let methods = nodes.methods().lock();
+    let methods = nodes.callables().methods().lock();
     let mut all = methods.iter();
     let found = all.find(|(_, callable)| callable.topic() == goal);
     found.map_or_else(|| address::unmapped_call(goal), |(node, _)| node.clone())

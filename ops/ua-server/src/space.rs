@@ -161,12 +161,12 @@ impl Space {
 
     /// Sets the limits of past values.
     pub(crate) fn limit_past(&self, mapping: &Mapping) {
-        self.manager.inner().limit_past(mapping);
+        self.manager.inner().live().limit_past(mapping);
     }
 
     /// Sets the size limit of written values, in bytes.
     pub(crate) fn limit_writes(&self, largest: usize) {
-        self.manager.inner().limit_writes(largest);
+        self.manager.inner().writes().limit(largest);
     }
 
     /// Handles a sample: the fields of its DataSet as a key frame carries them. A sample that
@@ -218,6 +218,7 @@ impl Space {
         let kept = self
             .manager
             .inner()
+            .live()
             .show(&self.subscriptions, &known.node, shown);
         match why {
             Some((_, why)) => Err(why),
@@ -230,8 +231,8 @@ impl Space {
         let known = self.topics.get(&topic);
         // The status of a value of another server is the status of that server.
         if let Some(known) = known.filter(|known| !known.node.sourced) {
-            let nodes = self.manager.inner();
-            nodes.show_arrival(&self.subscriptions, &known.node, has_arrived);
+            let writes = self.manager.inner().writes();
+            writes.show_arrival(&self.subscriptions, &known.node, has_arrived);
         }
     }
 
@@ -247,12 +248,12 @@ impl Space {
 
     /// Returns the status of a topic as it is shown.
     pub(crate) fn status(&self, topic: TopicId) -> StatusCode {
-        self.manager.inner().shown(topic).stamp.status
+        self.manager.inner().live().shown(topic).stamp.status
     }
 
     /// Returns the source timestamp of the value that is shown.
     pub(crate) fn shown(&self, topic: TopicId) -> Option<Timestamp> {
-        self.manager.inner().shown(topic).stamp.source
+        self.manager.inner().live().shown(topic).stamp.source
     }
 
     /// Marks the last value of a topic as stale or as current. The value and its source timestamp
@@ -349,8 +350,8 @@ impl Space {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
         };
-        let nodes = self.manager.inner();
-        let mut shown = nodes.shown(topic);
+        let live = self.manager.inner().live();
+        let mut shown = live.shown(topic);
         if shown.block.is_none() {
             shown.block = known.over.take();
         }
@@ -362,7 +363,7 @@ impl Space {
         }
         shown.stamp.status = worn.status().unwrap_or(known.status);
         shown.stamp.server = DateTime::now();
-        nodes.show_again(&self.subscriptions, &known.node, shown);
+        live.show_again(&self.subscriptions, &known.node, shown);
     }
 
     /// Removes the nodes of unmapped topics with silent writers, longest silent first, if it is

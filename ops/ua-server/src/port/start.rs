@@ -188,7 +188,7 @@ pub(super) fn show_limits(
     limit(manager.inner(), mapping);
     let conditions = history.map(|(mut store, values)| {
         let conditions = store.take_conditions();
-        manager.inner().keep_past_in((store, values));
+        manager.inner().live().keep_past_in((store, values));
         conditions
     });
     pubsub.stand(places(handle, manager));
@@ -247,8 +247,8 @@ pub(super) fn tell_serving(layout: &Layout, pki: &Pki, (url, port): (&EndpointUr
 
 /// Sets the limits of written values and of past values.
 fn limit(nodes: &SpaceNodes, mapping: &Mapping) {
-    nodes.limit_writes(largest_write(mapping));
-    nodes.limit_past(mapping);
+    nodes.writes().limit(largest_write(mapping));
+    nodes.live().limit_past(mapping);
 }
 
 /// Creates the channels of the node manager, with their receivers.
