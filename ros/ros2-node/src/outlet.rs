@@ -8,6 +8,10 @@
 //! known here before our writer is known there. Samples written in between are history, which a
 //! volatile reader does not receive.
 
+mod former;
+mod settling;
+mod waiting;
+
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -15,6 +19,9 @@ use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
 
+pub use self::former::Former;
+use self::settling::{PATIENCE, SETTLE, Settling};
+use self::waiting::{Sample, UnsentSamples};
 use crate::graph::Endpoint;
 use crate::limits;
 use crate::qos::Offered;
@@ -26,12 +33,8 @@ pub struct Outlet {
     offered: Offered,
     joined: Instant,
     audience: Audience,
-    /// Samples for which the send window had no room, oldest first.
-    waiting: VecDeque<Sample>,
-    /// A time before which no waiting sample expires.
-    expires: Option<Instant>,
-    /// Whether an expired sample was dropped and not reported yet.
-    has_late: bool,
+    /// Samples for which the send window had no room.
+    waiting: UnsentSamples,
     /// The time since when the send window has no room.
     full_since: Option<Instant>,
     /// Bytes written after the last time that every reader had acknowledged everything.
@@ -43,22 +46,6 @@ pub struct Outlet {
     to_forget: Option<Instant>,
     /// Replaced writers, oldest first, while their readers may miss some of their samples.
     former: VecDeque<Former>,
-}
-
-/// A former writer that only repairs the samples it has written.
-pub struct Former {
-    writer: Writer,
-    until: Instant,
-}
-
-#[derive(Debug, Clone)]
-struct Sample {
-    payload: Payload,
-    source: Option<Timestamp>,
-    /// Whether late readers receive the sample.
-    lasting: bool,
-    /// The time at which the sample expires.
-    until: Option<Instant>,
 }
 
 /// The readers of the topic.
@@ -77,14 +64,6 @@ enum Audience {
         seen: usize,
         sample_size: usize,
     },
-}
-
-/// The wait for readers to discover the writer.
-#[derive(Debug, Clone, Copy)]
-struct Settling {
-    since: Instant,
-    /// How long to wait for a silent reader.
-    patience: Duration,
 }
 
 /// The progress of the samples that were offered.
@@ -139,9 +118,7 @@ impl Outlet {
             offered,
             joined,
             audience: Audience::Nobody { held: None },
-            waiting: VecDeque::new(),
-            expires: None,
-            has_late: false,
+            waiting: UnsentSamples::default(),
             full_since: None,
             in_flight: 0,
             last: None,
@@ -177,8 +154,12 @@ impl Outlet {
             self.former.pop_front();
         }
         // A held value is newer than the last written value.
-        if self.waiting.is_empty() && !matches!(self.audience, Audience::Nobody { held: Some(_) }) {
-            self.waiting.extend(self.last.clone());
+        let is_held = matches!(self.audience, Audience::Nobody { held: Some(_) });
+        if let Some(last) = &self.last
+            && self.waiting.is_empty()
+            && !is_held
+        {
+            self.waiting.push(last.clone());
         }
         if let Audience::Present { settling, .. } = &mut self.audience {
             *settling = Some(Settling {
@@ -223,9 +204,7 @@ impl Outlet {
         if let Audience::Nobody { held } = &mut self.audience {
             *held = None;
         }
-        for sample in &mut self.waiting {
-            sample.lasting = false;
-        }
+        self.waiting.forget();
         if self.last.take().is_some() {
             self.to_forget = Some(now);
         }
@@ -352,9 +331,8 @@ impl Outlet {
             Audience::Present { .. } => {}
         }
         if !self.is_settled(now) {
-            let bytes: usize = self.waiting.iter().map(|s| s.payload.len()).sum();
-            if self.waiting.len() < self.settling_room() && bytes < MAX_IN_FLIGHT {
-                self.wait(sample);
+            if self.waiting.len() < self.settling_room() && self.waiting.bytes() < MAX_IN_FLIGHT {
+                self.waiting.push(sample);
                 return Ok(());
             }
             // Readers that have responded must not lose samples because of a silent reader.
@@ -377,38 +355,25 @@ impl Outlet {
     /// expired.
     pub fn flush(&mut self, now: Instant) -> Result<(), Refusal> {
         self.flush_waiting(now)?;
-        match std::mem::take(&mut self.has_late) {
-            true => Err(Refusal::Late),
-            false => Ok(()),
-        }
-    }
-
-    fn flush_waiting(&mut self, now: Instant) -> Result<(), Refusal> {
-        self.look_back(now);
-        self.drop_expired(now);
-        if self.waiting.is_empty() || !self.is_settled(now) {
-            return Ok(());
-        }
-        while let Some(sample) = self.waiting.pop_front() {
-            if let Some(unsent) = self.write(sample, now)? {
-                self.waiting.push_front(unsent);
-                break;
-            }
+        if self.waiting.take_late() {
+            return Err(Refusal::Late);
         }
         Ok(())
     }
 
-    /// Drops the waiting samples that have expired. Looks at them only if one can have expired,
-    /// since this is called for each sample.
-    fn drop_expired(&mut self, now: Instant) {
-        let is_over = |until: Option<Instant>| until.is_some_and(|until| until <= now);
-        if !is_over(self.expires) {
-            return;
+    fn flush_waiting(&mut self, now: Instant) -> Result<(), Refusal> {
+        self.look_back(now);
+        self.waiting.drop_expired(now);
+        if self.waiting.is_empty() || !self.is_settled(now) {
+            return Ok(());
         }
-        let before = self.waiting.len();
-        self.waiting.retain(|sample| !is_over(sample.until));
-        self.has_late |= self.waiting.len() < before;
-        self.expires = self.waiting.iter().filter_map(|sample| sample.until).min();
+        while let Some(sample) = self.waiting.pop() {
+            if let Some(unsent) = self.write(sample, now)? {
+                self.waiting.put_back(unsent);
+                break;
+            }
+        }
+        Ok(())
     }
 
     /// Updates the readers of the topic, and sends the held value to the first readers.
@@ -508,7 +473,7 @@ impl Outlet {
     fn leave_alone(&mut self, now: Instant) {
         let mut held = None;
         if self.offered == Offered::KeepLatest {
-            held = self.waiting.drain(..).next_back();
+            held = self.waiting.take_newest();
         }
         self.audience = Audience::Nobody { held: None };
         if let Some(held) = held {
@@ -573,19 +538,14 @@ impl Outlet {
     fn queue(&mut self, sample: Sample, room: usize) -> Result<(), Refusal> {
         let overflow = self.waiting.len() >= room;
         if overflow {
-            self.waiting.pop_front();
+            self.waiting.pop();
         }
-        self.wait(sample);
+        self.waiting.push(sample);
         if overflow {
             Err(Refusal::Overflow)
         } else {
             Ok(())
         }
-    }
-
-    fn wait(&mut self, sample: Sample) {
-        self.expires = self.expires.into_iter().chain(sample.until).min();
-        self.waiting.push_back(sample);
     }
 
     /// Passes a sample to RustDDS; returns it if the send window is full.
@@ -699,34 +659,6 @@ impl Outlet {
     }
 }
 
-impl Former {
-    /// Returns the writer if every value counts and a reader may miss some. Of a state only the
-    /// last value counts, with which the next writer starts: an old value must not reach a reader
-    /// in addition.
-    fn of(writer: Writer, offered: Offered, in_flight: usize, now: Instant) -> Option<Self> {
-        (matches!(offered, Offered::DropOldest(_)) && in_flight > 0).then(|| Self {
-            writer,
-            until: now + REPAIRED_WITHIN,
-        })
-    }
-
-    /// Returns whether the readers have received all its samples, or had time to request repairs.
-    #[must_use]
-    pub fn is_done(&self, now: Instant) -> bool {
-        // A wait of zero returns immediately.
-        let acknowledged = self.writer.wait_for_acknowledgments(Duration::ZERO);
-        now >= self.until || !matches!(acknowledged, Ok(false))
-    }
-}
-
-impl std::fmt::Debug for Former {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Former")
-            .field("writer", &self.writer.guid())
-            .finish_non_exhaustive()
-    }
-}
-
 impl std::fmt::Debug for Outlet {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Outlet")
@@ -738,35 +670,6 @@ impl std::fmt::Debug for Outlet {
     }
 }
 
-impl Settling {
-    /// Returns whether the readers receive written samples, according to their acknowledgements.
-    #[cfg(feature = "patched-dds")]
-    fn is_over(&self, writer: &Writer, seen: usize, joined: Instant, now: Instant) -> bool {
-        let readers = writer.matched_readers();
-        let age = now.saturating_duration_since(self.since);
-        let told = readers.silent + readers.greeting == 0 && readers.in_step > 0;
-        // Readers that were present before us are not all known when the first of them has
-        // responded, and discovered readers may not have matched yet.
-        let all = readers.in_step >= seen && now.saturating_duration_since(joined) >= SETTLE;
-        let some = readers.in_step + readers.greeting + readers.best_effort > 0;
-        told && readers.best_effort == 0 && all
-            || some && readers.silent == 0 && age >= SETTLE
-            || age >= self.patience
-    }
-
-    /// Returns whether the readers most likely receive written samples.
-    #[cfg(not(feature = "patched-dds"))]
-    fn is_over(&self, _writer: &Writer, _seen: usize, _joined: Instant, now: Instant) -> bool {
-        now.saturating_duration_since(self.since) >= SETTLE.min(self.patience)
-    }
-}
-
-/// How long peers take to discover our writer after we discovered their reader: 30 to 190 ms
-/// measured.
-const SETTLE: Duration = Duration::from_millis(250);
-/// How long to wait for a first reader that is silent: the announcement of our writer may have been
-/// lost and repeated.
-const PATIENCE: Duration = Duration::from_secs(3);
 /// Samples that may wait during that time, for state topics and event topics.
 const SETTLING_STATES: usize = 128;
 const SETTLING_EVENTS: usize = 512;
@@ -777,9 +680,6 @@ const STUCK_AFTER: Duration = Duration::from_millis(500);
 /// process may have no room.
 #[cfg(feature = "patched-dds")]
 const SLOWEST: Duration = Duration::from_secs(10);
-/// How long a replaced writer stays for readers that miss samples. This covers one or two repairs;
-/// a killed reader acknowledges nothing.
-const REPAIRED_WITHIN: Duration = Duration::from_secs(1);
 /// Maximum number of replaced writers of a topic.
 const MOST_FORMER: usize = 2;
 /// Memory limit of a topic for readers that do not acknowledge; the send window counts samples of
