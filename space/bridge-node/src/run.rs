@@ -7,6 +7,7 @@ mod network;
 mod outbox;
 mod redundancy;
 mod taps;
+mod turn;
 
 use std::collections::BTreeMap;
 use std::future::poll_fn;
@@ -42,6 +43,7 @@ use crate::tap::Taps;
 pub(crate) use fixed::Fixed;
 pub(crate) use outbox::Outbox;
 use outbox::Parcel;
+pub(crate) use turn::Turn;
 
 /// The run loop of one space, with its Router, port and carrier, and the requests for the status.
 pub(crate) struct Shell<P> {
@@ -83,25 +85,6 @@ pub(crate) struct Shell<P> {
     pub(crate) observer: Option<Arc<dyn Observer>>,
     /// Announces the space outside the group until it is dropped.
     pub(crate) _told: Option<Box<dyn Send + Sync>>,
-}
-
-/// The number of datagrams, or of events of the port, that a run loop handles in a row.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Turn {
-    /// The program has a thread of its own.
-    Whole,
-    /// Other programs share the thread. The first values of a burst do not wait in one program
-    /// until the other program has handled all of them.
-    Shared,
-}
-
-impl Turn {
-    const fn length(self) -> usize {
-        match self {
-            Self::Whole => 32,
-            Self::Shared => 8,
-        }
-    }
 }
 
 /// Whether the program runs or is about to end.
