@@ -6,7 +6,7 @@ use mappings::FieldMap;
 use messages::{MessageType, Plan, Selection};
 use uadp::Fields;
 
-use crate::call::{CallDescription, CallField, CallRole, Origin};
+use crate::call::{CallDescription, CallField, CallRole, CallTypeError, Origin};
 use crate::call_plan;
 use crate::counters::Cause;
 use crate::description::Described;
@@ -37,11 +37,11 @@ impl ByName {
     /// `None` for the known description.
     ///
     /// # Errors
-    /// Returns the reason for users if the fields do not fit the message.
+    /// Returns the reason if the fields do not fit the message.
     pub(crate) fn arrange(
         &mut self,
         described: Arc<Described>,
-    ) -> Result<Option<(Arc<MessageType>, Selection)>, String> {
+    ) -> Result<Option<(Arc<MessageType>, Selection)>, CallTypeError> {
         if let Some((known, _)) = &self.arranged
             && *known == described
         {
@@ -74,7 +74,7 @@ impl ByName {
 fn order(
     described: &Described,
     (message_type, map): (&MessageType, &FieldMap),
-) -> Result<(Selection, Vec<Origin>), String> {
+) -> Result<(Selection, Vec<Origin>), CallTypeError> {
     let fields = described.fields.iter().map(CallField::of).collect();
     let call = CallDescription {
         name: String::new(),

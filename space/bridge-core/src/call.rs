@@ -7,11 +7,11 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use mappings::{Assigned, FieldMap, Overflow, SpaceId, TopicId};
-use messages::{Leaf, MessageType, Rank, Selected, Selection, ServiceType, TypeName};
+use messages::{Leaf, MessageType, PlanError, Rank, Selected, Selection, ServiceType, TypeName};
 use uadp::action::{ExecutionId, Refusal};
 use uadp::{BuiltinType, StatusCode};
 
-use crate::constant;
+use crate::constant::{self, ConstantFault};
 use crate::counters::Counters;
 
 /// The arguments and results of a call, as in its ActionMetaData.
@@ -337,6 +337,63 @@ impl CallField {
     }
 }
 
+/// Reason for which a call does not have the fields of a ROS type.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum CallTypeError {
+    /// A constant of the mapping does not fit a field of the request.
+    #[error(transparent)]
+    Constant(#[from] ConstantFault),
+    /// The type has no field for a field of the call's request.
+    #[error("its request has the field {field}, which {lacked_by} lacks")]
+    NoRequestField {
+        /// The field of the call with its type.
+        field: String,
+        /// The request of the service type.
+        lacked_by: TypeName,
+    },
+    /// The type has no field of the name in the mapping.
+    #[error(
+        "its request takes {field} from `{path}`, but {lacked_by} has no such field of this type"
+    )]
+    NoAssignedField {
+        /// The field of the call with its type.
+        field: String,
+        /// The name in the mapping.
+        path: String,
+        /// The request of the service type.
+        lacked_by: TypeName,
+    },
+    /// The call's request has no field for a field of the type.
+    #[error("{message} has the field `{path}`, which its request lacks")]
+    NotRequested {
+        /// The request of the service type.
+        message: TypeName,
+        /// The field of the service type.
+        path: String,
+    },
+    /// The call's response has no field for a field of the type.
+    #[error(
+        "{message} has the field `{field}` ({kind}), but its response has no `{path}` of this type"
+    )]
+    NotAnswered {
+        /// The response of the service type.
+        message: TypeName,
+        /// The field of the service type.
+        field: String,
+        /// The type of the field.
+        kind: String,
+        /// The field that the response lacks.
+        path: String,
+    },
+    /// The messages of the type cannot be converted.
+    #[error(transparent)]
+    Plan(#[from] PlanError),
+    /// The payloads of the local side are fields.
+    #[error("the local side has no ROS types")]
+    NoRosTypes,
+}
+
 impl CallDescription {
     /// Returns whether a request may have no fields.
     #[must_use]
@@ -354,8 +411,8 @@ impl CallDescription {
     /// type's request are ignored.
     ///
     /// # Errors
-    /// Returns the reason for users if the type does not fit.
-    pub fn fits(&self, service: &ServiceType, map: &CallMap) -> Result<(), String> {
+    /// Returns the reason if the type does not fit.
+    pub fn fits(&self, service: &ServiceType, map: &CallMap) -> Result<(), CallTypeError> {
         self.request_order(service.request(), &map.request)?;
         self.response_order(service.response(), &map.response)?;
         Ok(())
@@ -366,16 +423,16 @@ impl CallDescription {
         &self,
         message: &MessageType,
         map: &FieldMap,
-    ) -> Result<Option<Vec<Origin>>, String> {
+    ) -> Result<Option<Vec<Origin>>, CallTypeError> {
         let leaves = message.leaves();
         if leaves.is_empty() && map.is_empty() && self.may_be_empty() {
             return Ok(None);
         }
-        let origin = |field: &CallField| {
+        let origin = |field: &CallField| -> Result<Origin, CallTypeError> {
             let path = match map.source(&field.name) {
                 Some(Assigned::Constant(literal)) => {
-                    return constant::block(field, (field.builtin, field.rank), &literal)
-                        .map(Origin::Constant);
+                    let block = constant::block(field, (field.builtin, field.rank), &literal)?;
+                    return Ok(Origin::Constant(block));
                 }
                 Some(Assigned::Field(path)) => path,
                 None => field.name.clone(),
@@ -386,35 +443,41 @@ impl CallDescription {
                     && field.builtin == leaf.builtin
             };
             let found = leaves.iter().position(find).map(Origin::Leaf);
+            let is_same_name = path == field.name;
             // An optional field without a source is sent as null, so that its default value is
             // used.
             let found = found.or_else(|| {
                 let is_left_out = field.optional
-                    && path == field.name
+                    && is_same_name
                     && !leaves
                         .iter()
                         .any(|leaf| path.eq_ignore_ascii_case(&leaf.path));
                 is_left_out.then(|| Origin::Constant(constant::NULL.to_vec()))
             });
-            found.ok_or_else(|| match path == field.name {
-                true => format!("its request has the field {field}, which {} lacks", message.name()),
-                false => format!(
-                    "its request takes {field} from `{path}`, but {} has no such field of this type",
-                    message.name()
-                ),
+            found.ok_or_else(|| {
+                let (field, lacked_by) = (field.to_string(), message.name().clone());
+                if is_same_name {
+                    CallTypeError::NoRequestField { field, lacked_by }
+                } else {
+                    CallTypeError::NoAssignedField {
+                        field,
+                        path,
+                        lacked_by,
+                    }
+                }
             })
         };
-        let order: Vec<Origin> = self.request.iter().map(origin).collect::<Result<_, _>>()?;
+        let order = self.request.iter().map(origin);
+        let order: Vec<Origin> = order.collect::<Result<_, _>>()?;
         let missing = leaves
             .iter()
             .enumerate()
             .find(|(at, _)| !order.contains(&Origin::Leaf(*at)));
         match missing {
-            Some((_, leaf)) if map.is_empty() => Err(format!(
-                "{} has the field `{}`, which its request lacks",
-                message.name(),
-                leaf.path
-            )),
+            Some((_, leaf)) if map.is_empty() => Err(CallTypeError::NotRequested {
+                message: message.name().clone(),
+                path: leaf.path.clone(),
+            }),
             Some(_) | None => Ok(Some(order)),
         }
     }
@@ -425,7 +488,7 @@ impl CallDescription {
         &self,
         message: &MessageType,
         map: &FieldMap,
-    ) -> Result<(Selection, Vec<usize>), String> {
+    ) -> Result<(Selection, Vec<usize>), CallTypeError> {
         let (mut fields, mut rest) = (Vec::new(), BTreeMap::new());
         let mut order = Vec::new();
         for leaf in message.leaves() {
@@ -443,13 +506,11 @@ impl CallDescription {
                     && field.builtin == leaf.builtin
             };
             let found = self.response.iter().position(find);
-            order.push(found.ok_or_else(|| {
-                let kind = kind(leaf.builtin, leaf.rank);
-                format!(
-                    "{} has the field `{}` ({kind}), but its response has no `{path}` of this type",
-                    message.name(),
-                    leaf.path,
-                )
+            order.push(found.ok_or_else(|| CallTypeError::NotAnswered {
+                message: message.name().clone(),
+                field: leaf.path.clone(),
+                kind: kind(leaf.builtin, leaf.rank),
+                path,
             })?);
             fields.push(Selected::whole(&leaf.path));
         }

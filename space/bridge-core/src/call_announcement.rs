@@ -24,8 +24,8 @@ use crate::call::{
     ActionFamily, CallDescription, CallField, CallRole, CallStructure, FieldNote, join_name,
 };
 use crate::description::{
-    MAX_ANNOUNCEMENT, MAX_NAME, data_type, field_id, list, read_rank, sizes, text, value_rank,
-    version_time, with_structures,
+    DescriptionFault, MAX_ANNOUNCEMENT, MAX_NAME, data_type, field_id, list, read_rank, sizes,
+    text, value_rank, version_time, with_structures,
 };
 use crate::learned::Weight;
 use crate::redundancy::Rank as BridgeRank;
@@ -326,16 +326,16 @@ impl Side<'_> {
 /// without the topic.
 ///
 /// # Errors
-/// Returns the reason in words if the announcement cannot be used.
+/// Returns the reason if the announcement cannot be used.
 pub(crate) fn read(
     action: &ActionMetaData<'_>,
     name: &str,
-) -> Result<(CallDescription, u16), String> {
+) -> Result<(CallDescription, u16), DescriptionFault> {
     let target = action.action_targets.get(0);
-    let target = target.ok_or("it has no target")?.action_target_id;
+    let target = target.ok_or(DescriptionFault::NoTarget)?.action_target_id;
     let about = action.request.description.text.unwrap_or_default();
     if name.len() > MAX_NAME || about.len() > MAX_ABOUT {
-        return Err("its name or description is too long".to_owned());
+        return Err(DescriptionFault::Text);
     }
     let description = CallDescription {
         name: name.to_owned(),
@@ -411,19 +411,19 @@ fn read_family(value: &Variant<'_>) -> Option<ActionFamily> {
     numbers.next().is_none().then_some(family)
 }
 
-fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, String> {
+fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, DescriptionFault> {
     if data_set.fields.len() > MAX_CALL_FIELDS {
-        return Err(format!("more than {MAX_CALL_FIELDS} fields"));
+        return Err(DescriptionFault::Fields(MAX_CALL_FIELDS));
     }
     let structures = read_structures(&data_set.schema);
     let fields = data_set.fields.iter().map(|field| {
         let name = field.name.unwrap_or_default();
         if name.len() > MAX_NAME {
-            return Err("the name of a field is too long".to_owned());
+            return Err(DescriptionFault::FieldName);
         }
         let builtin = field
             .builtin_type()
-            .ok_or_else(|| format!("{} is not a builtin type", field.built_in_type))?;
+            .ok_or(DescriptionFault::Builtin(field.built_in_type))?;
         let optional = field.properties.iter().any(|property| {
             property.key == OPTIONAL && property.value == Variant::Scalar(Scalar::Boolean(true))
         });

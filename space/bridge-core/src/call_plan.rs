@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use messages::{MessageType, Plan, PlanError, Selection, ServiceType, Wire};
+use messages::{MessageType, Plan, Selection, ServiceType, Wire};
 use uadp::{Fields, Variant};
 
 use crate::block::{NO_FIELDS, block, too_big};
-use crate::call::{CallDescription, CallMap, Origin};
+use crate::call::{CallDescription, CallMap, CallTypeError, Origin};
 use crate::counters::{Cause, Reason};
 use crate::fields::{self, Payload};
 use crate::plans::Plans;
@@ -26,15 +26,13 @@ impl CallPlan {
     /// Compiles the conversion between a call and a service type.
     ///
     /// # Errors
-    /// Returns the reason for users if they do not fit.
+    /// Returns the reason if they do not fit.
     pub(crate) fn compile(
         description: &CallDescription,
         (service, map): (&ServiceType, &CallMap),
         (wire, plans): (Wire, &mut Plans),
-    ) -> Result<Self, String> {
-        let why = |error: PlanError| error.to_string();
-        let mut plan =
-            |message, selection: &Selection| plans.plan(message, selection, wire).map_err(why);
+    ) -> Result<Self, CallTypeError> {
+        let mut plan = |message, selection: &Selection| plans.plan(message, selection, wire);
         let request_order = description.request_order(service.request(), &map.request)?;
         let (made, order) = description.response_order(service.response(), &map.response)?;
         Ok(Self {
@@ -114,15 +112,12 @@ impl ExecutedPlan {
     /// Compiles the conversion for a call with the fields of the type.
     ///
     /// # Errors
-    /// Returns the reason for users if a plan cannot be compiled.
+    /// Returns the reason if a plan cannot be compiled.
     pub(crate) fn compile(
         service: &ServiceType,
         (wire, plans): (Wire, &mut Plans),
-    ) -> Result<Self, String> {
-        let mut plan = |message: &Arc<MessageType>| {
-            let plan = plans.plan(message, &Selection::Whole, wire);
-            plan.map_err(|error| error.to_string())
-        };
+    ) -> Result<Self, CallTypeError> {
+        let mut plan = |message: &Arc<MessageType>| plans.plan(message, &Selection::Whole, wire);
         Ok(Self {
             request: plan(service.request())?,
             response: plan(service.response())?,

@@ -11,23 +11,65 @@ use crate::counters::Cause;
 /// The block with a single null field, for a field without a value.
 pub(crate) const NULL: [u8; 3] = [1, 0, 0];
 
+/// Reason for which a constant of the mapping does not fit its field.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ConstantFault {
+    /// A field of bytes has another constant than a list of bytes.
+    #[error("{field} takes bytes: give a list of numbers from 0 to 255")]
+    NotBytes {
+        /// The field with its type.
+        field: String,
+    },
+    /// The array of the field has a fixed length, and the list has another.
+    #[error("{field} has another number of elements")]
+    Length {
+        /// The field with its type.
+        field: String,
+    },
+    /// A list for a scalar.
+    #[error("{field} does not take a list")]
+    List {
+        /// The field with its type.
+        field: String,
+    },
+    /// A single value for an array.
+    #[error("{field} takes a list, such as [1, 2]")]
+    Single {
+        /// The field with its type.
+        field: String,
+    },
+    /// A text that is no value of the type of the field.
+    #[error("`{text}` is not a valid value of {field}")]
+    Value {
+        /// The text in the mapping.
+        text: String,
+        /// The field with its type.
+        field: String,
+    },
+    /// The value cannot be encoded.
+    #[error("{0}")]
+    Encoding(String),
+}
+
 /// Returns the block with a single field of the given name, type and value. The value is a number,
 /// text or Boolean, bytes as a list of numbers, or an array of these.
 ///
 /// # Errors
-/// Returns a message for users if the value does not fit the type of the field.
+/// Returns the reason if the value does not fit the type of the field.
 pub(crate) fn block(
     field: &impl Display,
     (builtin, rank): (BuiltinType, Rank),
     literal: &Literal,
-) -> Result<Vec<u8>, String> {
+) -> Result<Vec<u8>, ConstantFault> {
+    let name = || field.to_string();
     let texts = match (literal, rank, builtin) {
         (Literal::One(text), Rank::Scalar, _) => std::slice::from_ref(text),
         (Literal::List(texts), Rank::Scalar, BuiltinType::ByteString) => {
             let numbers = texts.iter().map(|text| text.parse::<u8>());
-            let bytes: Vec<u8> = numbers.collect::<Result<_, _>>().map_err(|_| {
-                format!("{field} takes bytes: give a list of numbers from 0 to 255")
-            })?;
+            let bytes: Vec<u8> = numbers
+                .collect::<Result<_, _>>()
+                .map_err(|_| ConstantFault::NotBytes { field: name() })?;
             return encode(|frame| frame.scalar(Scalar::ByteString(Some(&bytes))));
         }
         (Literal::List(texts), Rank::Array { fixed }, _)
@@ -36,15 +78,20 @@ pub(crate) fn block(
             texts
         }
         (Literal::List(_), Rank::Array { .. }, _) => {
-            return Err(format!("{field} has another number of elements"));
+            return Err(ConstantFault::Length { field: name() });
         }
-        (Literal::List(_), Rank::Scalar, _) => return Err(format!("{field} does not take a list")),
+        (Literal::List(_), Rank::Scalar, _) => {
+            return Err(ConstantFault::List { field: name() });
+        }
         (Literal::One(_), Rank::Array { .. }, _) => {
-            return Err(format!("{field} takes a list, such as [1, 2]"));
+            return Err(ConstantFault::Single { field: name() });
         }
     };
     let values = texts.iter().map(|text| {
-        constant(builtin, text).ok_or_else(|| format!("`{text}` is not a valid value of {field}"))
+        constant(builtin, text).ok_or_else(|| ConstantFault::Value {
+            text: text.clone(),
+            field: name(),
+        })
     });
     let values: Vec<Scalar<'_>> = values.collect::<Result<_, _>>()?;
     encode(|frame| match rank {
@@ -58,9 +105,9 @@ pub(crate) fn block(
 
 fn encode(
     write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), uadp::EncodeError>,
-) -> Result<Vec<u8>, String> {
+) -> Result<Vec<u8>, ConstantFault> {
     let written = block::block(|frame| write(frame).map_err(block::too_big));
-    written.map_err(|(_, why): (Cause, String)| why)
+    written.map_err(|(_, why): (Cause, String)| ConstantFault::Encoding(why))
 }
 
 #[cfg(test)]
@@ -78,6 +125,7 @@ mod tests {
         assert_eq!(field, Variant::Scalar(Scalar::Int32(100)));
         assert!(fields.next().is_none());
         let why = block(&"`speed`", speed, &Literal::One("fast".to_owned())).unwrap_err();
+        let why = why.to_string();
         assert!(why.contains("`fast`") && why.contains("`speed`"), "{why}");
         block(&"`speed`", speed, &Literal::List(vec!["1".to_owned()])).unwrap_err();
         let list = (BuiltinType::Double, Rank::Array { fixed: None });

@@ -87,8 +87,10 @@ impl Described {
     /// Reads the announcement of a topic; `None` if it names no ROS type.
     ///
     /// # Errors
-    /// Returns the reason in words if the announcement cannot be used.
-    pub(crate) fn read(meta_data: &DataSetMetaDataType<'_>) -> Result<Option<Self>, String> {
+    /// Returns the reason if the announcement cannot be used.
+    pub(crate) fn read(
+        meta_data: &DataSetMetaDataType<'_>,
+    ) -> Result<Option<Self>, DescriptionFault> {
         let Some(description) = meta_data.description.text else {
             return Ok(None);
         };
@@ -98,18 +100,18 @@ impl Described {
             None => (made, false),
         };
         if name.len() > MAX_NAME {
-            return Err("the name of the type is too long".to_owned());
+            return Err(DescriptionFault::TypeName);
         }
         let (_, called) = meta_data.name.and_then(split_name).unzip();
         let called = called.unwrap_or_default();
         if called.len() > MAX_NAME || about.len() > MAX_ABOUT {
-            return Err("its name or description is too long".to_owned());
+            return Err(DescriptionFault::Text);
         }
         let Ok(message_type) = name.parse() else {
             return Ok(None);
         };
         if meta_data.fields.len() > MAX_FIELDS {
-            return Err(format!("more than {MAX_FIELDS} fields"));
+            return Err(DescriptionFault::Fields(MAX_FIELDS));
         }
         let fields = meta_data.fields.iter().map(|field| read_field(&field));
         Ok(Some(Self {
@@ -122,6 +124,29 @@ impl Described {
     }
 }
 
+/// Reason for which an announcement cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum DescriptionFault {
+    #[error("more than {0} fields")]
+    Fields(usize),
+    #[error("the name of the type is too long")]
+    TypeName,
+    #[error("its name or description is too long")]
+    Text,
+    #[error("the name of a field is too long")]
+    FieldName,
+    #[error("{0} is not a builtin type")]
+    Builtin(u8),
+    #[error("a field has ValueRank {0}, which ROS does not support")]
+    ValueRank(i32),
+    #[error("a field of more than {0} dimensions")]
+    Dimensions(usize),
+    #[error("it has no target")]
+    NoTarget,
+    #[error("the limit of described topics with fields is reached")]
+    Full,
+}
+
 impl Weight for Described {
     fn weight(&self) -> usize {
         let names: usize = self.fields.iter().map(|field| field.path.len()).sum();
@@ -130,13 +155,13 @@ impl Weight for Described {
     }
 }
 
-fn read_field(field: &FieldMetaData<'_>) -> Result<Leaf, String> {
+fn read_field(field: &FieldMetaData<'_>) -> Result<Leaf, DescriptionFault> {
     let path = field.name.unwrap_or_default();
     if path.len() > MAX_NAME {
-        return Err("the name of a field is too long".to_owned());
+        return Err(DescriptionFault::FieldName);
     }
     let Some(builtin) = field.builtin_type() else {
-        return Err(format!("{} is not a builtin type", field.built_in_type));
+        return Err(DescriptionFault::Builtin(field.built_in_type));
     };
     Ok(Leaf {
         path: path.to_owned(),
@@ -149,15 +174,13 @@ fn read_field(field: &FieldMetaData<'_>) -> Result<Leaf, String> {
 ///
 /// # Errors
 /// The field has or may have several dimensions.
-pub(crate) fn read_rank(field: &FieldMetaData<'_>) -> Result<Rank, String> {
+pub(crate) fn read_rank(field: &FieldMetaData<'_>) -> Result<Rank, DescriptionFault> {
     match field.value_rank {
         -1 => Ok(Rank::Scalar),
         1 => Ok(Rank::Array {
             fixed: field.array_dimensions.get(0).filter(|length| *length > 0),
         }),
-        other => Err(format!(
-            "a field has ValueRank {other}, which ROS does not support"
-        )),
+        other => Err(DescriptionFault::ValueRank(other)),
     }
 }
 

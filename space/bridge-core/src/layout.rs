@@ -8,7 +8,7 @@ use messages::Rank;
 use uadp::discovery::{DataSetMetaDataType, VersionMatch};
 use uadp::{BuiltinType, ConfigurationVersion, DataSetHeader, RawField};
 
-use crate::description::{MAX_FIELDS, MAX_NAME};
+use crate::description::{DescriptionFault, MAX_FIELDS, MAX_NAME};
 use crate::learned::Weight;
 
 /// The fields of a DataSet, as announced by its writer or as defined in the mapping.
@@ -32,24 +32,24 @@ impl Layout {
     /// Reads the announcement of the sender at the address `from`.
     ///
     /// # Errors
-    /// Returns the reason in words if the announcement cannot be used.
+    /// Returns the reason if the announcement cannot be used.
     pub(crate) fn read(
         meta_data: &DataSetMetaDataType<'_>,
         from: SocketAddr,
-    ) -> Result<Self, String> {
+    ) -> Result<Self, DescriptionFault> {
         if meta_data.fields.len() > MAX_FIELDS {
-            return Err(format!("more than {MAX_FIELDS} fields"));
+            return Err(DescriptionFault::Fields(MAX_FIELDS));
         }
         let fields = meta_data.fields.iter().map(|field| {
             let name = field.name.unwrap_or_default();
             if name.len() > MAX_NAME {
-                return Err("the name of a field is too long".to_owned());
+                return Err(DescriptionFault::FieldName);
             }
             let Some(builtin) = field.builtin_type() else {
-                return Err(format!("{} is not a builtin type", field.built_in_type));
+                return Err(DescriptionFault::Builtin(field.built_in_type));
             };
             if field.array_dimensions.len() > MAX_DIMENSIONS {
-                return Err(format!("a field of more than {MAX_DIMENSIONS} dimensions"));
+                return Err(DescriptionFault::Dimensions(MAX_DIMENSIONS));
             }
             Ok(Field {
                 name: name.to_owned(),

@@ -57,10 +57,11 @@ mod writer;
 pub use application::{Application, Endpoint};
 pub use call::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription,
-    CallField, CallMap, CallRole, CallStructure, Executed, Execution, FieldNote, Offered,
-    OfferedType, ValueDescription, ValueNote, split_name,
+    CallField, CallMap, CallRole, CallStructure, CallTypeError, Executed, Execution, FieldNote,
+    Offered, OfferedType, ValueDescription, ValueNote, split_name,
 };
 pub use confirm::{Arrival, Handover};
+pub use constant::ConstantFault;
 pub use counters::{Counters, Reason, Verdict};
 pub use description::{Described, ROS_TOPICS};
 pub use fields::{decode_fields, encode_fields};

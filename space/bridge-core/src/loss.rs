@@ -4,8 +4,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use mappings::{LossAction, Mapping, ServiceRole, TopicId, Trigger};
-use messages::{Literal, MessageType, NoFields, Plan, PlanError, Selected, Selection, Wire};
-use uadp::{BuiltinType, DateTime, Fields, Timestamp};
+use messages::{
+    Literal, MessageType, NoFields, Plan, PlanError, Selected, Selection, Wire, WriteError,
+};
+use uadp::{BuiltinType, DateTime, DecodeError, Fields, Timestamp};
 
 use crate::fields;
 
@@ -26,6 +28,20 @@ pub(crate) enum Reaction {
     Publish(Stop),
     /// Delivers the value of another topic that calls its service.
     Call(TopicId),
+}
+
+/// Reason for which the reaction to a loss cannot be delivered.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum ReactionFault {
+    #[error("the service of {0} is unknown here")]
+    UnknownService(TopicId),
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    #[error(transparent)]
+    Stamp(#[from] DecodeError),
+    /// The message with the time stamp cannot be written.
+    #[error("{0}")]
+    Stamped(String),
 }
 
 /// A message of constants.
@@ -63,18 +79,18 @@ impl Stop {
     /// Writes the message.
     ///
     /// # Errors
-    /// Returns the reason in words.
-    pub(crate) fn write(&self, now: Timestamp, out: &mut Vec<u8>) -> Result<(), String> {
+    /// Returns the reason if the message cannot be written.
+    pub(crate) fn write(&self, now: Timestamp, out: &mut Vec<u8>) -> Result<(), ReactionFault> {
         if !self.is_stamped {
-            let written = self.plan.write(&mut NoFields, out);
-            return written.map_err(|error| error.to_string());
+            return Ok(self.plan.write(&mut NoFields, out)?);
         }
         let DateTime(ticks) = now.time;
         let mut block = 1_u16.to_le_bytes().to_vec();
         block.push(BuiltinType::DateTime.id());
         block.extend_from_slice(&ticks.to_le_bytes());
-        let stamp = Fields::parse(&block).map_err(|error| error.to_string())?;
-        fields::write(&self.plan, stamp, out).map_err(|(_, detail)| detail)
+        let stamp = Fields::parse(&block)?;
+        let written = fields::write(&self.plan, stamp, out);
+        written.map_err(|(_, detail)| ReactionFault::Stamped(detail))
     }
 }
 

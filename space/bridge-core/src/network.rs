@@ -56,17 +56,22 @@ pub(crate) fn join<'a>(
     message.finish()
 }
 
+/// A DataSetMessage is larger than the mapping allows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("a message of {size} bytes; `pubsub.max_message` allows {} MiB", max_message >> 20)]
+pub(crate) struct MessageTooBig {
+    size: usize,
+    max_message: u32,
+}
+
 /// Checks that a DataSetMessage has at most `max_message` bytes. It is called for DataSetMessages
 /// that are too big for a datagram.
-pub(crate) fn check_size(encoded: &Encoded, max_message: u32) -> Result<(), String> {
+pub(crate) fn check_size(encoded: &Encoded, max_message: u32) -> Result<(), MessageTooBig> {
     let size = encoded.data_set_message().len();
     if u32::try_from(size).is_ok_and(|size| size <= max_message) {
         return Ok(());
     }
-    Err(format!(
-        "a message of {size} bytes; `pubsub.max_message` allows {} MiB",
-        max_message >> 20
-    ))
+    Err(MessageTooBig { size, max_message })
 }
 
 /// Writes the chunk that starts at `offset` bytes in the DataSetMessage of a sample. Returns the

@@ -20,7 +20,7 @@ use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
 use crate::takes::Takes;
-use crate::transcoder::Transcoder;
+use crate::transcoder::{TranscodeError, Transcoder};
 use crate::writer::Writer;
 
 /// A topic of the own space or of another space.
@@ -34,7 +34,7 @@ pub(crate) struct Topic {
     pub(crate) bound: Option<Box<(Arc<MessageType>, Selection)>>,
     /// Converts bytes of the other ROS version to the local type, or the reason why no conversion
     /// exists.
-    pub(crate) transcoder: Option<Box<Result<Transcoder, String>>>,
+    pub(crate) transcoder: Option<Box<Result<Transcoder, TranscodeError>>>,
     /// Makes the message from fields by their names, for values that are not in the mapping.
     pub(crate) by_name: Option<Box<ByName>>,
     pub(crate) queue: Queue<Item>,

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use messages::{Dialect, MessageType, Plan, Registry, Selection, Wire};
+use messages::{
+    DefinitionError, Dialect, MessageType, Plan, PlanError, Registry, Selection, TypeName, Wire,
+};
 use uadp::{
     DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, Scalar, Variant,
 };
@@ -18,6 +20,27 @@ pub(crate) struct Transcoder {
     namespace: u16,
 }
 
+/// The local type cannot be made from messages of the other ROS version.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{there} messages arrive as bytes, but {here} requires {name}: {cause}")]
+pub(crate) struct TranscodeError {
+    there: &'static str,
+    here: &'static str,
+    name: TypeName,
+    cause: Box<TranscodeCause>,
+}
+
+/// Reason of a [`TranscodeError`].
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+enum TranscodeCause {
+    #[error(transparent)]
+    Definition(#[from] DefinitionError),
+    #[error(transparent)]
+    Plan(#[from] PlanError),
+    #[error("{there} {name} has other fields")]
+    Differs { there: &'static str, name: TypeName },
+}
+
 impl Transcoder {
     /// Compiles the conversion of messages in the encoding of `origin` to the type `local`.
     ///
@@ -28,24 +51,28 @@ impl Transcoder {
         origin: Dialect,
         local: &Arc<MessageType>,
         namespace: u16,
-    ) -> Result<Self, String> {
+    ) -> Result<Self, TranscodeError> {
         let name = local.name();
         let (there, here) = (label(origin), label(local.dialect()));
-        let why = |error: String| {
-            format!("{there} messages arrive as bytes, but {here} requires {name}: {error}")
+        let why = |cause: TranscodeCause| TranscodeError {
+            there,
+            here,
+            name: name.clone(),
+            cause: Box::new(cause),
         };
         let foreign = Registry::bundle(origin)
             .get(name)
-            .map_err(|error| why(error.to_string()))?;
+            .map_err(|error| why(error.into()))?;
         let differs = foreign.leaves().len() != local.leaves().len()
             || foreign.leaves().iter().zip(local.leaves()).any(|(a, b)| {
                 a.builtin != b.builtin || a.rank != b.rank || !a.path.eq_ignore_ascii_case(&b.path)
             });
         if differs {
-            return Err(why(format!("{there} {name} has other fields")));
+            let name = name.clone();
+            return Err(why(TranscodeCause::Differs { there, name }));
         }
         let plan = |message: &Arc<MessageType>, wire| {
-            Plan::compile(message, &Selection::Whole, wire).map_err(|error| why(error.to_string()))
+            Plan::compile(message, &Selection::Whole, wire).map_err(|error| why(error.into()))
         };
         Ok(Self {
             from: plan(&foreign, wire(origin))?,

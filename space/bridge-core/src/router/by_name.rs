@@ -84,7 +84,7 @@ impl Values {
             Ok(Some((message_type, selection))) => self
                 .bind_type(topic, (&message_type, &selection), now)
                 .map_err(|error| error.to_string()),
-            Err(why) => Err(why),
+            Err(why) => Err(why.to_string()),
         };
         if let Err(why) = bound {
             let cause = (Reason::Mismatch, "type");

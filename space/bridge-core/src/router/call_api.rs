@@ -14,7 +14,8 @@ use super::announce::BAD_NOT_FOUND;
 use super::calls::CallTraffic;
 use super::{About, Router};
 use crate::call::{
-    AskId, CallCounters, CallDescription, CallMap, Executed, Offered, OfferedType, join_name,
+    AskId, CallCounters, CallDescription, CallMap, CallTypeError, Executed, Offered, OfferedType,
+    join_name,
 };
 use crate::counters::Reason;
 use crate::late;
@@ -66,14 +67,14 @@ impl Router {
     /// type is checked when its description arrives.
     ///
     /// # Errors
-    /// Returns the reason for users if the known call does not fit the type. The call stays bound
+    /// Returns the reason if the known call does not fit the type. The call stays bound
     /// nevertheless, because its description may change.
     pub fn bind_call(
         &mut self,
         topic: TopicId,
         target: (&Arc<ServiceType>, &Arc<CallMap>),
         now: Now,
-    ) -> Result<(), String> {
+    ) -> Result<(), CallTypeError> {
         self.call_traffic().bind_call(topic, target, now)
     }
 
@@ -115,14 +116,14 @@ impl Router {
     /// are ROS messages in the local encoding.
     ///
     /// # Errors
-    /// Returns the reason for users if the type cannot be executed, or if the payloads of the local
-    /// side are fields.
+    /// Returns the reason if the type cannot be executed, or if the payloads of the local side are
+    /// fields.
     pub fn offer_type(
         &mut self,
         topic: TopicId,
         offered: &OfferedType,
         now: Now,
-    ) -> Result<(), String> {
+    ) -> Result<(), CallTypeError> {
         self.call_traffic().offer_type(topic, offered, now)
     }
 

@@ -33,7 +33,9 @@ use super::announcements::Announcements;
 use super::security::Security;
 use super::senders::RedundantSenders;
 use super::{About, Values};
-use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap};
+use crate::call::{
+    AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap, CallTypeError,
+};
 use crate::call_announcement::LASTING_TARGET;
 use crate::call_plan::CallPlan;
 use crate::counters::{Cause, Reason};
@@ -104,7 +106,7 @@ struct Bound {
     service: Arc<ServiceType>,
     map: Arc<CallMap>,
     /// `None` while the call is not known.
-    plan: Option<Result<Arc<CallPlan>, String>>,
+    plan: Option<Result<Arc<CallPlan>, CallTypeError>>,
 }
 
 /// A request of the local side.
@@ -231,14 +233,14 @@ impl CallTraffic<'_> {
     /// type is checked when its description arrives.
     ///
     /// # Errors
-    /// Returns the reason for users if the known call does not fit the type. The call stays bound
+    /// Returns the reason if the known call does not fit the type. The call stays bound
     /// nevertheless, because its description may change.
     pub(super) fn bind_call(
         &mut self,
         topic: TopicId,
         (service, map): (&Arc<ServiceType>, &Arc<CallMap>),
         now: Now,
-    ) -> Result<(), String> {
+    ) -> Result<(), CallTypeError> {
         if self.wire().is_none() || self.values.is_home(topic) {
             return Ok(());
         }
@@ -261,7 +263,7 @@ impl CallTraffic<'_> {
     }
 
     /// Compiles the plan of a call that is known and bound.
-    fn compile(&mut self, topic: TopicId) -> Result<(), String> {
+    fn compile(&mut self, topic: TopicId) -> Result<(), CallTypeError> {
         let wire = self.wire();
         let call = self.calls.as_mut();
         let call = call.and_then(|calls| calls.table.get_mut(&topic));
@@ -391,7 +393,7 @@ impl CallTraffic<'_> {
                 }),
             ) => Some(
                 plan.clone()
-                    .map_err(|why| refuse(Refusal::InvalidArgument, "type", why))?,
+                    .map_err(|why| refuse(Refusal::InvalidArgument, "type", why.to_string()))?,
             ),
             (Some(_), _) => {
                 let text = format!("{topic} has no type here");

@@ -8,7 +8,7 @@ use mappings::TopicId;
 use super::about::About;
 use super::values::Values;
 use crate::counters::Reason;
-use crate::loss::Reaction;
+use crate::loss::{Reaction, ReactionFault};
 use crate::message::Message;
 use crate::network::keep_alive;
 use crate::output::{Delivery, GOOD, Kept, Output};
@@ -115,7 +115,7 @@ impl Values {
         let mut payload = self.buffer();
         let written = match stop {
             Some(stop) => stop.write(now.utc, &mut payload),
-            None => Err(format!("the service of {by} is unknown here", by = of)),
+            None => Err(ReactionFault::UnknownService(of)),
         };
         if let Err(detail) = written {
             self.recycle(payload);

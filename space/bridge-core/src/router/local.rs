@@ -72,7 +72,7 @@ impl Values {
         let large = encoded.bytes.len() > usize::from(max_datagram);
         if written.is_ok() && large {
             written = check_size(&encoded, max_message)
-                .map_err(|detail| ((Reason::TooBig, "max_message").into(), detail));
+                .map_err(|error| ((Reason::TooBig, "max_message").into(), error.to_string()));
         }
         if let Err((cause, detail)) = written {
             self.recycle(encoded.bytes);

@@ -9,7 +9,7 @@ use uadp::discovery::DataSetMetaDataType;
 use super::about::About;
 use super::values::Values;
 use crate::counters::Reason;
-use crate::description::Described;
+use crate::description::{Described, DescriptionFault};
 use crate::layout::Layout;
 use crate::learned::{News, Rank};
 use crate::output::Output;
@@ -43,14 +43,14 @@ impl Values {
         if !self.is_learned(topic) {
             answered();
             if let Some(why) = fault {
-                self.count(about, Reason::MetaData, 1, || why);
+                self.count(about, Reason::MetaData, 1, || why.to_string());
             }
             return;
         }
         let described = match Described::read(meta_data) {
             Ok(described) => described,
             Err(why) => {
-                self.count(about, (Reason::MetaData, "useless"), 1, || why);
+                self.count(about, (Reason::MetaData, "useless"), 1, || why.to_string());
                 return;
             }
         };
@@ -167,12 +167,12 @@ impl Values {
         meta_data: &DataSetMetaDataType<'_>,
         from: SocketAddr,
         now: Now,
-    ) -> Result<(), String> {
+    ) -> Result<(), DescriptionFault> {
         let layout = Layout::read(meta_data, from)?;
         let until = (now.monotonic, self.mapping.pubsub().metadata_period);
         let rank = rank(&self.topics, &self.mapping, now.monotonic);
         match self.layouts.learn(topic, layout, until, rank) {
-            News::Full => Err("the limit of described topics with fields is reached".to_owned()),
+            News::Full => Err(DescriptionFault::Full),
             News::Same | News::Other => Ok(()),
         }
     }

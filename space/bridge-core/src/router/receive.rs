@@ -523,7 +523,7 @@ impl Values {
                 let scratch = scratch.insert(self.buffers.take());
                 transcoder.run(sample.fields.clone(), scratch, &mut payload)
             }
-            (Some(_), Some(Err(why))) => Err((Reason::Mismatch.into(), why.clone())),
+            (Some(_), Some(Err(why))) => Err((Reason::Mismatch.into(), why.to_string())),
             (Some(plan), None) => match by_name {
                 Some(by_name) => by_name.write(plan, sample.fields.bytes(), &mut payload),
                 None => fields::write(plan, sample.fields.clone(), &mut payload),

@@ -18,12 +18,14 @@ pub fn call_type(
 ) -> Result<Arc<ServiceType>, String> {
     if let Some(name) = mapped {
         let service_type = find(name)?;
-        call.fits(&service_type, map)?;
+        call.fits(&service_type, map)
+            .map_err(|error| error.to_string())?;
         return Ok(service_type);
     }
     if let Some(name) = named(call) {
         let service_type = find(&name)?;
-        call.fits(&service_type, map)?;
+        call.fits(&service_type, map)
+            .map_err(|error| error.to_string())?;
         return Ok(service_type);
     }
     let standard = match call.response.is_empty() {
@@ -65,7 +67,8 @@ pub fn action_type(
     let name = mapped.cloned().or_else(|| named(call));
     let name = name.ok_or("its executor announces no action type")?;
     let calls = find(&name)?;
-    call.fits(calls.goal(), map)?;
+    call.fits(calls.goal(), map)
+        .map_err(|error| error.to_string())?;
     Ok(calls)
 }
 

@@ -16,7 +16,9 @@ use super::super::About;
 use super::super::values::Values;
 use super::CallTraffic;
 use super::own::{Own, Running};
-use crate::call::{CallDescription, CallField, Executed, Execution, Offered, OfferedType};
+use crate::call::{
+    CallDescription, CallField, CallTypeError, Executed, Execution, Offered, OfferedType,
+};
 use crate::call_announcement::{CallAnnouncement, LASTING_TARGET, Types};
 use crate::call_plan::ExecutedPlan;
 use crate::counters::{Cause, Reason};
@@ -37,16 +39,16 @@ impl CallTraffic<'_> {
     /// are ROS messages in the local encoding.
     ///
     /// # Errors
-    /// Returns the reason for users if the type cannot be executed, or if the payloads of the local
-    /// side are fields.
+    /// Returns the reason if the type cannot be executed, or if the payloads of the local side are
+    /// fields.
     pub(in super::super) fn offer_type(
         &mut self,
         topic: TopicId,
         offered: &OfferedType,
         now: Now,
-    ) -> Result<(), String> {
+    ) -> Result<(), CallTypeError> {
         let Some(wire) = self.wire() else {
-            return Err("the local side has no ROS types".to_owned());
+            return Err(CallTypeError::NoRosTypes);
         };
         let service = &offered.service_type;
         let plan = ExecutedPlan::compile(service, (wire, &mut self.values.plans))?;

@@ -136,7 +136,7 @@ impl CallTraffic<'_> {
             Ok(said) => self.take_in_call(topic, said, from, now),
             Err(why) => {
                 let cause = (Reason::MetaData, "useless");
-                self.count_call(topic, Some(from), cause, || why);
+                self.count_call(topic, Some(from), cause, || why.to_string());
             }
         }
     }
@@ -229,7 +229,8 @@ impl CallTraffic<'_> {
             return;
         }
         if let Err(why) = self.compile(topic) {
-            self.count_call(topic, None, (Reason::Mismatch, "type"), || why);
+            let cause = (Reason::Mismatch, "type");
+            self.count_call(topic, None, cause, || why.to_string());
         }
         if let Some(calls) = &mut self.calls
             && let Some(known) = calls.table.get(&topic).and_then(|call| call.known.as_ref())
