@@ -1,6 +1,6 @@
 //! Fuzzes RML mappings and the XML files that they map with arbitrary text.
 
-use rml::{Files, Mapping};
+use rml::{FileFault, Files, Mapping};
 
 /// Reads a mapping, and runs it with the file that follows it after a line of three dashes.
 pub fn rml(input: &[u8]) {
@@ -25,7 +25,7 @@ pub fn rml(input: &[u8]) {
 struct Every<'f>(&'f [u8]);
 
 impl Files for Every<'_> {
-    fn read(&mut self, _name: &str) -> Result<Vec<u8>, String> {
+    fn read(&mut self, _name: &str) -> Result<Vec<u8>, FileFault> {
         Ok(self.0.to_vec())
     }
 }

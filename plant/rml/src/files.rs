@@ -2,16 +2,55 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::Read as _;
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
+
+/// Reason for which a file of a mapping cannot be read, with the remedy.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum FileFault {
+    /// The name is a URL.
+    #[error("it is a URL, and nothing is fetched; save the file beside the mapping and name it")]
+    Url,
+    /// The path does not exist, or cannot be resolved.
+    #[error("cannot open {}: {error}", path.display())]
+    Open {
+        /// The path of the file or folder.
+        path: PathBuf,
+        /// The error of the system.
+        error: io::Error,
+    },
+    /// The file is outside of the folder of the mapping.
+    #[error("it is outside of the folder {}; move it there, or give it as NAME=FILE", .0.display())]
+    Outside(PathBuf),
+    /// The path is a folder or a device.
+    #[error("{} is no file", .0.display())]
+    NoFile(PathBuf),
+    /// The file cannot be read.
+    #[error("cannot read {}: {error}", path.display())]
+    Read {
+        /// The path of the file.
+        path: PathBuf,
+        /// The error of the system.
+        error: io::Error,
+    },
+    /// The file is too large.
+    #[error("it has {bytes} bytes, more than the {most} that are read")]
+    Size {
+        /// The size of the file.
+        bytes: u64,
+        /// The limit.
+        most: u64,
+    },
+}
 
 /// Access to the files that a mapping names.
 pub trait Files {
     /// Returns the contents of a file.
     ///
     /// # Errors
-    /// A text with the reason and the remedy.
-    fn read(&mut self, name: &str) -> Result<Vec<u8>, String>;
+    /// [`FileFault`].
+    fn read(&mut self, name: &str) -> Result<Vec<u8>, FileFault>;
 }
 
 /// The files of a folder, and contents that take the place of named files.
@@ -39,40 +78,39 @@ impl Folder {
         self
     }
 
-    fn path(&self, name: &str) -> Result<PathBuf, String> {
+    fn path(&self, name: &str) -> Result<PathBuf, FileFault> {
         if name.contains("://") {
-            return Err(
-                "it is a URL, and nothing is fetched; save the file beside the mapping and name it"
-                    .to_owned(),
-            );
+            return Err(FileFault::Url);
         }
-        let root = self.root.canonicalize();
-        let root = root.map_err(|error| format!("cannot open {}: {error}", self.root.display()))?;
-        let path = root.join(name);
-        let found = path
-            .canonicalize()
-            .map_err(|error| format!("cannot open {}: {error}", path.display()))?;
+        let resolved = |path: &Path| {
+            path.canonicalize().map_err(|error| FileFault::Open {
+                path: path.to_owned(),
+                error,
+            })
+        };
+        let root = resolved(&self.root)?;
+        let found = resolved(&root.join(name))?;
         if !found.starts_with(&root) {
-            return Err(format!(
-                "it is outside of the folder {}; move it there, or give it as NAME=FILE",
-                root.display()
-            ));
+            return Err(FileFault::Outside(root));
         }
         Ok(found)
     }
 }
 
 impl Files for Folder {
-    fn read(&mut self, name: &str) -> Result<Vec<u8>, String> {
+    fn read(&mut self, name: &str) -> Result<Vec<u8>, FileFault> {
         if let Some(given) = self.given.get(name) {
             check_size(u64::try_from(given.len()).unwrap_or(u64::MAX))?;
             return Ok(given.clone());
         }
         let path = self.path(name)?;
-        let cannot = |error: std::io::Error| format!("cannot read {}: {error}", path.display());
+        let cannot = |error: io::Error| FileFault::Read {
+            path: path.clone(),
+            error,
+        };
         let metadata = path.metadata().map_err(cannot)?;
         if !metadata.is_file() {
-            return Err(format!("{} is no file", path.display()));
+            return Err(FileFault::NoFile(path));
         }
         check_size(metadata.len())?;
         let mut bytes = Vec::new();
@@ -82,11 +120,12 @@ impl Files for Folder {
     }
 }
 
-fn check_size(bytes: u64) -> Result<(), String> {
+fn check_size(bytes: u64) -> Result<(), FileFault> {
     if bytes > MAX_FILE {
-        Err(format!(
-            "it has {bytes} bytes, more than the {MAX_FILE} that are read"
-        ))
+        Err(FileFault::Size {
+            bytes,
+            most: MAX_FILE,
+        })
     } else {
         Ok(())
     }

@@ -16,6 +16,6 @@ mod run;
 mod write;
 mod xpath;
 
-pub use files::{Files, Folder};
+pub use files::{FileFault, Files, Folder};
 pub use mapping::{Mapping, MappingFault};
 pub use run::Output;

@@ -1,6 +1,7 @@
 //! Reads a mapping from Turtle, in the vocabulary of R2RML with RML, or in that of RML alone. Both
 //! name the same things alike, so that a term counts by its local name.
 
+mod fault;
 mod terms;
 
 pub(crate) use terms::{blank, is_default_graph, is_language};
@@ -10,6 +11,7 @@ use std::collections::{BTreeSet, HashMap};
 use oxrdf::{NamedOrBlankNode, Term, Triple};
 use oxttl::TurtleParser;
 
+use self::fault::TriplesMapFault;
 use crate::mapping::{
     LogicalSource, Mapping, MappingFault, ObjectMap, PredicateObject, TermKind, TriplesMap,
 };
@@ -100,22 +102,33 @@ impl<'a> Graph<'a> {
     }
 
     /// Returns the only value of a property.
-    fn one(&self, subject: &NamedOrBlankNode, property: &str) -> Result<Option<&'a Term>, String> {
+    fn one(
+        &self,
+        subject: &NamedOrBlankNode,
+        property: &str,
+    ) -> Result<Option<&'a Term>, TriplesMapFault> {
         match self.all(subject, property).as_slice() {
             [] => Ok(None),
             [one] => Ok(Some(one)),
-            several => Err(format!(
-                "there are {} of `{property}`; leave one",
-                several.len()
-            )),
+            several => Err(TriplesMapFault::Several {
+                count: several.len(),
+                property: property.to_owned(),
+            }),
         }
     }
 
-    fn text(&self, subject: &NamedOrBlankNode, property: &str) -> Result<Option<&'a str>, String> {
+    fn text(
+        &self,
+        subject: &NamedOrBlankNode,
+        property: &str,
+    ) -> Result<Option<&'a str>, TriplesMapFault> {
         match self.one(subject, property)? {
             None => Ok(None),
             Some(Term::Literal(literal)) => Ok(Some(literal.value())),
-            Some(other) => Err(format!("`{property}` is a text, and not {other}")),
+            Some(other) => Err(TriplesMapFault::NoText {
+                property: property.to_owned(),
+                found: other.to_string(),
+            }),
         }
     }
 }
@@ -161,21 +174,21 @@ impl<'a> Reading<'a> {
         }
         let names = self.names.clone();
         let read = names.into_iter().map(|name| {
-            self.map(name).map_err(|problem| MappingFault::Map {
+            self.map(name).map_err(|fault| MappingFault::Map {
                 map: name.to_string(),
-                problem,
+                problem: fault.to_string(),
             })
         });
         read.collect()
     }
 
-    fn map(&mut self, node: &'a NamedOrBlankNode) -> Result<TriplesMap, String> {
+    fn map(&mut self, node: &'a NamedOrBlankNode) -> Result<TriplesMap, TriplesMapFault> {
         self.known_only(node, node, "the triples map", &PROPERTIES_OF_MAP);
         if self.graph.one(node, "logicalTable")?.is_some() {
-            return Err("rr:logicalTable names a database; only XML files are read".to_owned());
+            return Err(TriplesMapFault::LogicalTable);
         }
         let source = self.graph.one(node, "logicalSource")?;
-        let source = source.ok_or("it has no rml:logicalSource")?;
+        let source = source.ok_or(TriplesMapFault::NoLogicalSource)?;
         let source = self.source(self.node(source, "logicalSource")?, node)?;
         let namespaces = self
             .sources
@@ -184,10 +197,7 @@ impl<'a> Reading<'a> {
             .unwrap_or_default();
         let subject = self.term_nodes(node, "subject")?;
         let [subject] = subject.as_slice() else {
-            return Err(format!(
-                "it has {} subject maps, and needs one",
-                subject.len()
-            ));
+            return Err(TriplesMapFault::Subjects(subject.len()));
         };
         let mut scope = Scope {
             map: node,
@@ -200,7 +210,7 @@ impl<'a> Reading<'a> {
                 match class {
                     Term::NamedNode(class) => classes.push(class.clone()),
                     other @ (Term::BlankNode(_) | Term::Literal(_)) => {
-                        return Err(format!("the class {other} is no IRI"));
+                        return Err(TriplesMapFault::Class(other.to_string()));
                     }
                 }
             }
@@ -234,7 +244,7 @@ impl<'a> Reading<'a> {
         &mut self,
         node: &'a NamedOrBlankNode,
         scope: &mut Scope<'_>,
-    ) -> Result<PredicateObject, String> {
+    ) -> Result<PredicateObject, TriplesMapFault> {
         self.known_only(
             scope.map,
             node,
@@ -245,7 +255,7 @@ impl<'a> Reading<'a> {
         for predicate in self.term_nodes(node, "predicate")? {
             let predicate = self.term(predicate, "predicate", TermKind::Iri, scope)?;
             if !matches!(predicate.kind, TermKind::Iri | TermKind::UnsafeIri) {
-                return Err("a predicate is an IRI; remove its term type".to_owned());
+                return Err(TriplesMapFault::Predicate);
             }
             predicates.push(predicate);
         }
@@ -261,11 +271,7 @@ impl<'a> Reading<'a> {
             });
         }
         if predicates.is_empty() || objects.is_empty() {
-            return Err(
-                "a predicate-object map needs a predicate and an object, for example `rr:predicate \
-                 ex:name; rr:objectMap [ rml:reference \"@Name\" ]`"
-                    .to_owned(),
-            );
+            return Err(TriplesMapFault::PredicateObject);
         }
         Ok(PredicateObject {
             predicates,
@@ -278,19 +284,20 @@ impl<'a> Reading<'a> {
         &mut self,
         node: &'a NamedOrBlankNode,
         scope: &Scope<'_>,
-    ) -> Result<ObjectMap, String> {
+    ) -> Result<ObjectMap, TriplesMapFault> {
         let parent = self.graph.one(node, "parentTriplesMap")?;
-        let parent = parent.ok_or("rr:parentTriplesMap is missing")?;
+        let parent = parent.ok_or(TriplesMapFault::NoParentMap)?;
         let known = self.names.iter().position(|name| match (name, parent) {
             (NamedOrBlankNode::NamedNode(name), Term::NamedNode(parent)) => name == parent,
             (NamedOrBlankNode::BlankNode(name), Term::BlankNode(parent)) => name == parent,
             _ => false,
         });
-        let map = known.ok_or_else(|| format!("the parent {parent} is no triples map"))?;
+        let map = known.ok_or_else(|| TriplesMapFault::UnknownParent(parent.to_string()))?;
         // Expressions of the parent are read with the namespaces of its own source.
-        let parent = self.names.get(map).copied().ok_or("no parent")?;
+        let parent = self.names.get(map).copied();
+        let parent = parent.ok_or(TriplesMapFault::NoParent)?;
         let source = self.graph.one(parent, "logicalSource")?;
-        let source = source.ok_or_else(|| format!("the parent {parent} has no source"))?;
+        let source = source.ok_or_else(|| TriplesMapFault::ParentSource(parent.to_string()))?;
         let namespaces = self.namespaces(self.node(source, "logicalSource")?)?;
         let parent_scope = Scope {
             map: parent,
@@ -312,14 +319,16 @@ impl<'a> Reading<'a> {
         &mut self,
         node: &'a NamedOrBlankNode,
         map: &NamedOrBlankNode,
-    ) -> Result<usize, String> {
+    ) -> Result<usize, TriplesMapFault> {
         self.known_only(map, node, "the logical source", &PROPERTIES_OF_SOURCE);
         let namespaces = self.namespaces(node)?;
         let source = self.graph.one(node, "source")?;
-        let file = self.file(source.ok_or("the logical source has no rml:source")?)?;
+        let file = self.file(source.ok_or(TriplesMapFault::NoSource)?)?;
         let written = self.graph.text(node, "iterator")?.unwrap_or("/");
-        let iterator = parse(written, &namespaces)
-            .map_err(|problem| format!("the iterator `{written}`: {problem}"))?;
+        let iterator = parse(written, &namespaces).map_err(|fault| TriplesMapFault::Iterator {
+            written: written.to_owned(),
+            fault,
+        })?;
         let source = LogicalSource {
             file,
             iterator,
@@ -333,7 +342,7 @@ impl<'a> Reading<'a> {
         Ok(self.sources.len() - 1)
     }
 
-    fn file(&self, source: &'a Term) -> Result<String, String> {
+    fn file(&self, source: &'a Term) -> Result<String, TriplesMapFault> {
         let node = match source {
             Term::Literal(path) => return Ok(path.value().to_owned()),
             // The IRI of a file was made absolute with the base of the mapping.
@@ -348,37 +357,27 @@ impl<'a> Reading<'a> {
                 Some("MappingDirectory" | "CurrentWorkingDirectory")
             );
             if !is_known {
-                return Err(format!(
-                    "rml:root {root} is not supported; files are read from the folder of the \
-                     mapping, rml:MappingDirectory"
-                ));
+                return Err(TriplesMapFault::Root(root.to_string()));
             }
         }
         if let Some(compression) = self.graph.one(node, "compression")?
             && named(compression) != Some("none")
         {
-            return Err("compressed sources are not read; unpack the file".to_owned());
+            return Err(TriplesMapFault::Compression);
         }
         let path = self.graph.text(node, "path")?;
-        path.map(str::to_owned).ok_or_else(|| {
-            "the source is no file; give its name as a text, or as rml:path".to_owned()
-        })
+        path.map(str::to_owned).ok_or(TriplesMapFault::NoFile)
     }
 
     /// Checks the reference formulation, and returns its namespaces.
-    fn namespaces(&self, source: &'a NamedOrBlankNode) -> Result<Vec<(String, String)>, String> {
+    fn namespaces(
+        &self,
+        source: &'a NamedOrBlankNode,
+    ) -> Result<Vec<(String, String)>, TriplesMapFault> {
         let formulation = self.graph.one(source, "referenceFormulation")?;
-        let refused = |found: &Term| {
-            format!("the reference formulation {found} is not supported; only XPath over XML is")
-        };
+        let refused = |found: &Term| TriplesMapFault::Formulation(found.to_string());
         let node = match formulation {
-            None => {
-                return Err(
-                    "the logical source has no rml:referenceFormulation; for XML give ql:XPath or \
-                     rml:XPath"
-                        .to_owned(),
-                );
-            }
+            None => return Err(TriplesMapFault::NoFormulation),
             Some(found) if named(found) == Some("XPath") => return Ok(Vec::new()),
             Some(found) => self.node(found, "").map_err(|_| refused(found))?,
         };
@@ -388,7 +387,7 @@ impl<'a> Reading<'a> {
                 && named(&statement.object) == Some("XPathReferenceFormulation")
         });
         if !is_xpath {
-            return Err(formulation.map(refused).unwrap_or_default());
+            return Err(formulation.map_or(TriplesMapFault::NoFormulation, refused));
         }
         let mut namespaces = Vec::new();
         for namespace in self.graph.all(node, "namespace") {
@@ -400,9 +399,7 @@ impl<'a> Reading<'a> {
                 _ => None,
             };
             let (Some(prefix), Some(url)) = (prefix, url) else {
-                return Err(
-                    "rml:namespace needs rml:namespacePrefix and rml:namespaceURL".to_owned(),
-                );
+                return Err(TriplesMapFault::Namespace);
             };
             namespaces.push((prefix.to_owned(), url.to_owned()));
         }
@@ -410,18 +407,24 @@ impl<'a> Reading<'a> {
     }
 
     /// Returns the resource that a term is.
-    fn node(&self, term: &Term, property: &str) -> Result<&'a NamedOrBlankNode, String> {
+    fn node(&self, term: &Term, property: &str) -> Result<&'a NamedOrBlankNode, TriplesMapFault> {
         let key = match term {
             Term::NamedNode(node) => NamedOrBlankNode::from(node.clone()),
             Term::BlankNode(node) => NamedOrBlankNode::from(node.clone()),
             Term::Literal(text) => {
-                return Err(format!("`{property}` is a resource, and not {text}"));
+                return Err(TriplesMapFault::NoResource {
+                    property: property.to_owned(),
+                    found: text.to_string(),
+                });
             }
         };
         let known = self.graph.by_subject.get_key_value(&key);
         known
             .map(|(node, _)| *node)
-            .ok_or_else(|| format!("nothing is stated about {term}, the `{property}`"))
+            .ok_or_else(|| TriplesMapFault::Unstated {
+                property: property.to_owned(),
+                term: term.to_string(),
+            })
     }
 
     fn note(&mut self, map: &NamedOrBlankNode, finding: &str) {

@@ -1,18 +1,21 @@
 //! Runs a mapping: the rows of its files to statements.
 
+mod sink;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::rc::Rc;
 
 use oxrdf::{BlankNode, GraphName, Literal, NamedNode, NamedOrBlankNode, Quad, Term};
 use roxmltree::{Document, ParsingOptions};
 
+use self::sink::Sink;
 use crate::files::Files;
 use crate::mapping::{
     Expression, JoinCondition, Mapping, MappingFault, ObjectMap, PredicateObject, TemplatePart,
     TermKind, TermMap, TermValue, TriplesMap,
 };
 use crate::read::{blank, is_default_graph, is_language};
-use crate::xpath::{Evaluator, NodeRef, WorkBudget};
+use crate::xpath::{EvaluationFault, Evaluator, NodeRef, WorkBudget};
 
 /// The statements of a run.
 #[derive(Debug, Clone)]
@@ -66,9 +69,9 @@ impl Mapping {
         }
         run.rows()?;
         for (number, map) in self.maps.iter().enumerate() {
-            run.map(number, map).map_err(|problem| MappingFault::Map {
+            run.map(number, map).map_err(|fault| MappingFault::Map {
                 map: map.name.clone(),
-                problem,
+                problem: fault.to_string(),
             })?;
         }
         let findings = run.findings.into_iter();
@@ -88,7 +91,7 @@ impl Mapping {
         for file in self.files() {
             let bytes = files
                 .read(file)
-                .map_err(|problem| self.file_fault(file, problem))?;
+                .map_err(|fault| self.file_fault(file, fault.to_string()))?;
             let text = xml_text::decode(&bytes)
                 .map_err(|fault| self.file_fault(file, fault.to_string()))?;
             total += text.len();
@@ -121,6 +124,28 @@ impl Mapping {
     }
 }
 
+/// Reason for which the rows of a triples map have no statements.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+enum RunFault {
+    #[error("the mapping makes more than {0} statements; narrow its iterators")]
+    Statements(usize),
+    #[error("the statements have more than {0} bytes; shorten the subjects")]
+    Bytes(usize),
+    #[error(
+        "the parent {0} has other rows; give a rr:joinCondition, or the same source and iterator"
+    )]
+    Parent(String),
+    #[error("`{written}`: {fault}")]
+    Expression {
+        written: String,
+        fault: EvaluationFault,
+    },
+    #[error("a row has more than {0} combinations of values; select fewer nodes")]
+    Combinations(usize),
+    #[error(transparent)]
+    Work(#[from] EvaluationFault),
+}
+
 struct Run<'a> {
     mapping: &'a Mapping,
     /// One per file.
@@ -142,35 +167,6 @@ struct Run<'a> {
 type JoinKey = (usize, Vec<String>);
 /// Rows by the values that join them.
 type RowIndex = HashMap<Vec<String>, Vec<usize>>;
-
-/// The statements, each once.
-#[derive(Default)]
-struct Sink {
-    quads: Vec<Quad>,
-    known: HashSet<Quad>,
-    /// The bytes of the terms of all statements.
-    bytes: usize,
-}
-
-impl Sink {
-    fn add(&mut self, quad: Quad) -> Result<(), String> {
-        if self.quads.len() >= MAX_STATEMENTS {
-            return Err(format!(
-                "the mapping makes more than {MAX_STATEMENTS} statements; narrow its iterators"
-            ));
-        }
-        if self.known.insert(quad.clone()) {
-            self.bytes = self.bytes.saturating_add(bytes_of(&quad));
-            if self.bytes > MAX_BYTES {
-                return Err(format!(
-                    "the statements have more than {MAX_BYTES} bytes; shorten the subjects"
-                ));
-            }
-            self.quads.push(quad);
-        }
-        Ok(())
-    }
-}
 
 /// A row of a triples map.
 #[derive(Clone, Copy)]
@@ -213,7 +209,7 @@ impl<'a> Run<'a> {
         rows.iter().map(row).collect()
     }
 
-    fn map(&mut self, number: usize, map: &'a TriplesMap) -> Result<(), String> {
+    fn map(&mut self, number: usize, map: &'a TriplesMap) -> Result<(), RunFault> {
         for (at, row) in self.rows_of(map).into_iter().enumerate() {
             let subjects: Vec<NamedOrBlankNode> = match self.subjects.get(&number) {
                 Some(known) => known.get(at).cloned().unwrap_or_default(),
@@ -245,7 +241,7 @@ impl<'a> Run<'a> {
         map: &'a TriplesMap,
         one: &'a PredicateObject,
         (row, subjects, graphs): (Row<'a>, &[NamedOrBlankNode], &BTreeSet<GraphKey>),
-    ) -> Result<(), String> {
+    ) -> Result<(), RunFault> {
         let mut all_graphs = self.graphs(&one.graphs, row)?;
         all_graphs.extend(graphs.iter().cloned());
         let mut predicates = Vec::new();
@@ -280,7 +276,7 @@ impl<'a> Run<'a> {
         &mut self,
         (subject, predicate, object): (&NamedOrBlankNode, NamedNode, Term),
         graphs: &BTreeSet<GraphKey>,
-    ) -> Result<(), String> {
+    ) -> Result<(), RunFault> {
         let default = graphs.is_empty().then_some(GraphName::DefaultGraph);
         let named = graphs.iter().map(|key| key.graph.clone());
         for graph in default.into_iter().chain(named) {
@@ -295,7 +291,11 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    fn graphs(&mut self, maps: &'a [TermMap], row: Row<'a>) -> Result<BTreeSet<GraphKey>, String> {
+    fn graphs(
+        &mut self,
+        maps: &'a [TermMap],
+        row: Row<'a>,
+    ) -> Result<BTreeSet<GraphKey>, RunFault> {
         let mut graphs = BTreeSet::new();
         for map in maps {
             for term in self.terms(map, row)? {
@@ -320,18 +320,14 @@ impl<'a> Run<'a> {
         map: &'a TriplesMap,
         (number, joins): (usize, &'a [JoinCondition]),
         row: Row<'a>,
-    ) -> Result<Vec<Term>, String> {
+    ) -> Result<Vec<Term>, RunFault> {
         let mapping = self.mapping;
         let Some(parent) = mapping.maps.get(number) else {
             return Ok(Vec::new());
         };
         if joins.is_empty() {
             if parent.source != map.source {
-                return Err(format!(
-                    "the parent {} has other rows; give a rr:joinCondition, or the same source and \
-                     iterator",
-                    parent.name
-                ));
+                return Err(RunFault::Parent(parent.name.clone()));
             }
             return self.terms(&parent.subject, row);
         }
@@ -357,7 +353,7 @@ impl<'a> Run<'a> {
         &mut self,
         number: usize,
         map: &'a TriplesMap,
-    ) -> Result<Rc<Vec<Vec<Term>>>, String> {
+    ) -> Result<Rc<Vec<Vec<Term>>>, RunFault> {
         if let Some(known) = self.subjects.get(&number) {
             return Ok(Rc::clone(known));
         }
@@ -375,7 +371,7 @@ impl<'a> Run<'a> {
         number: usize,
         map: &'a TriplesMap,
         joins: &'a [JoinCondition],
-    ) -> Result<Rc<RowIndex>, String> {
+    ) -> Result<Rc<RowIndex>, RunFault> {
         let written = joins.iter().map(|join| join.parent.written.clone());
         let key = (number, written.collect());
         if let Some(known) = self.indexes.get(&key) {
@@ -397,7 +393,7 @@ impl<'a> Run<'a> {
         &mut self,
         expressions: impl Iterator<Item = &'e Expression>,
         row: Row<'_>,
-    ) -> Result<Vec<Vec<String>>, String> {
+    ) -> Result<Vec<Vec<String>>, RunFault> {
         let mut keys: Vec<Vec<String>> = vec![Vec::new()];
         for expression in expressions {
             let values = self.expand(expression, row, TermKind::Literal)?;
@@ -413,7 +409,7 @@ impl<'a> Run<'a> {
     }
 
     /// Returns the terms of a term map for a row.
-    fn terms(&mut self, map: &'a TermMap, row: Row<'a>) -> Result<Vec<Term>, String> {
+    fn terms(&mut self, map: &'a TermMap, row: Row<'a>) -> Result<Vec<Term>, RunFault> {
         let expression = match &map.value {
             TermValue::Constant(Term::BlankNode(node)) => {
                 let node = self.blank_node(&format!("_:{}", node.as_str()));
@@ -465,7 +461,7 @@ impl<'a> Run<'a> {
         map: &'a TermMap,
         value: String,
         row: Row<'a>,
-    ) -> Result<Option<Literal>, String> {
+    ) -> Result<Option<Literal>, RunFault> {
         if let Some(language) = &map.language {
             let tags = self.expand(language, row, TermKind::Literal)?;
             let Some(tag) = tags.into_iter().next() else {
@@ -495,7 +491,7 @@ impl<'a> Run<'a> {
         expression: &Expression,
         row: Row<'_>,
         kind: TermKind,
-    ) -> Result<Vec<String>, String> {
+    ) -> Result<Vec<String>, RunFault> {
         let mut texts = vec![String::new()];
         for part in &expression.parts {
             let values = match part {
@@ -505,8 +501,10 @@ impl<'a> Run<'a> {
                         return Ok(Vec::new());
                     };
                     let values = evaluator.values(expr, row.node, &mut self.work);
-                    let mut values =
-                        values.map_err(|problem| format!("`{}`: {problem}", expression.written))?;
+                    let mut values = values.map_err(|fault| RunFault::Expression {
+                        written: expression.written.clone(),
+                        fault,
+                    })?;
                     if expression.is_template && kind == TermKind::Iri {
                         for value in &mut values {
                             *value = escaped(value);
@@ -570,40 +568,13 @@ fn product(count: usize, bytes: usize, values: &[String]) -> usize {
         .saturating_add(of_values.saturating_mul(count))
 }
 
-/// Returns the bytes of the terms of a statement.
-fn bytes_of(quad: &Quad) -> usize {
-    let subject = match &quad.subject {
-        NamedOrBlankNode::NamedNode(node) => node.as_str().len(),
-        NamedOrBlankNode::BlankNode(node) => node.as_str().len(),
-    };
-    let object = match &quad.object {
-        Term::NamedNode(node) => node.as_str().len(),
-        Term::BlankNode(node) => node.as_str().len(),
-        Term::Literal(literal) => {
-            let of_type = match literal.language() {
-                Some(language) => language.len(),
-                None => literal.datatype().as_str().len(),
-            };
-            literal.value().len() + of_type
-        }
-    };
-    let graph = match &quad.graph_name {
-        GraphName::NamedNode(node) => node.as_str().len(),
-        GraphName::BlankNode(node) => node.as_str().len(),
-        GraphName::DefaultGraph => 0,
-    };
-    subject + quad.predicate.as_str().len() + object + graph
-}
-
 fn combined<T>(
     all: &[T],
     values: &[String],
     join: impl Fn(&T, &String) -> T,
-) -> Result<Vec<T>, String> {
+) -> Result<Vec<T>, RunFault> {
     if all.len().saturating_mul(values.len()) > MAX_COMBINATIONS {
-        return Err(format!(
-            "a row has more than {MAX_COMBINATIONS} combinations of values; select fewer nodes"
-        ));
+        return Err(RunFault::Combinations(MAX_COMBINATIONS));
     }
     let pairs = all
         .iter()
@@ -680,9 +651,6 @@ const MAX_NODES: u32 = 8_000_000;
 const MAX_FILES: usize = 256 << 20;
 /// Maximum number of attributes of an element.
 const MAX_ATTRIBUTES: usize = 1000;
-const MAX_STATEMENTS: usize = 2_000_000;
-/// Maximum number of bytes of the terms of all statements.
-const MAX_BYTES: usize = 512 << 20;
 const MAX_COMBINATIONS: usize = 100_000;
 const MAX_FINDINGS: usize = 100;
 const MAX_SHOWN: usize = 80;
@@ -690,11 +658,12 @@ const MAX_SHOWN: usize = 80;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::files::FileFault;
 
     struct Deep;
 
     impl Files for Deep {
-        fn read(&mut self, _: &str) -> Result<Vec<u8>, String> {
+        fn read(&mut self, _: &str) -> Result<Vec<u8>, FileFault> {
             let (open, close) = ("<a>".repeat(300), "</a>".repeat(300));
             Ok(format!("{open}{close}").into_bytes())
         }
@@ -706,17 +675,6 @@ mod tests {
         assert_eq!(product(3, 10, &values), 3 * 2 + 10 * 2 + 2 * 3);
         assert_eq!(product(1, usize::MAX, &values), usize::MAX);
         assert_eq!(product(3, 10, &[]), 0);
-    }
-
-    #[test]
-    fn the_bytes_of_a_statement_are_those_of_its_terms() {
-        let node = |iri: &str| NamedNode::new(iri).unwrap();
-        let graph = GraphName::DefaultGraph;
-        let named = Quad::new(node("urn:s"), node("urn:pp"), node("urn:ooo"), graph);
-        assert_eq!(bytes_of(&named), 5 + 6 + 7);
-        let text = Literal::new_language_tagged_literal("four", "de").unwrap();
-        let literal = Quad::new(node("urn:s"), node("urn:pp"), text, node("urn:g"));
-        assert_eq!(bytes_of(&literal), 5 + 6 + 4 + 2 + 5);
     }
 
     /// The reference visits 300^3 nodes for each of 300 rows.

@@ -12,8 +12,8 @@ mod tokens;
 use std::fmt;
 use std::sync::Arc;
 
-pub(crate) use evaluate::{Evaluator, NodeRef, WorkBudget};
-pub(crate) use parse::parse;
+pub(crate) use evaluate::{EvaluationFault, Evaluator, NodeRef, WorkBudget};
+pub(crate) use parse::{XPathSyntaxFault, parse};
 
 /// The namespaces of prefixes in expressions. Without any, names match in all namespaces.
 pub(crate) type Namespaces = [(String, String)];

@@ -5,13 +5,13 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::{fs, process};
 
-use rml::{Files, Folder, Mapping, MappingFault, Output};
+use rml::{FileFault, Files, Folder, Mapping, MappingFault, Output};
 
 /// One text for all files.
 struct Text(String);
 
 impl Files for Text {
-    fn read(&mut self, _: &str) -> Result<Vec<u8>, String> {
+    fn read(&mut self, _: &str) -> Result<Vec<u8>, FileFault> {
         Ok(self.0.clone().into_bytes())
     }
 }

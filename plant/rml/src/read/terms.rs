@@ -2,6 +2,7 @@
 
 use oxrdf::{BlankNode, Literal, NamedNode, NamedOrBlankNode, Term};
 
+use super::fault::{TemplateFault, TriplesMapFault};
 use super::{Reading, Scope, TermNode, named};
 use crate::mapping::{Expression, TemplatePart, TermKind, TermMap, TermValue};
 use crate::xpath::{Namespaces, parse};
@@ -12,7 +13,7 @@ impl<'a> Reading<'a> {
         &self,
         node: &NamedOrBlankNode,
         role: &str,
-    ) -> Result<Vec<TermNode<'a>>, String> {
+    ) -> Result<Vec<TermNode<'a>>, TriplesMapFault> {
         let shortcuts = self.graph.all(node, role);
         let mut all: Vec<TermNode<'a>> = shortcuts.into_iter().map(TermNode::Constant).collect();
         let property = format!("{role}Map");
@@ -27,12 +28,12 @@ impl<'a> Reading<'a> {
         &mut self,
         node: &'a NamedOrBlankNode,
         scope: &mut Scope<'_>,
-    ) -> Result<Vec<TermMap>, String> {
+    ) -> Result<Vec<TermMap>, TriplesMapFault> {
         let mut graphs = Vec::new();
         for graph in self.graph_nodes(node)? {
             let graph = self.term(graph, "graph", TermKind::Iri, scope)?;
             if graph.kind == TermKind::Literal {
-                return Err("a graph is no literal; remove its term type".to_owned());
+                return Err(TriplesMapFault::Graph);
             }
             graphs.push(graph);
         }
@@ -40,7 +41,7 @@ impl<'a> Reading<'a> {
     }
 
     /// Returns graph maps. A map in the place of the constant of `rr:graph` counts as well.
-    fn graph_nodes(&self, node: &NamedOrBlankNode) -> Result<Vec<TermNode<'a>>, String> {
+    fn graph_nodes(&self, node: &NamedOrBlankNode) -> Result<Vec<TermNode<'a>>, TriplesMapFault> {
         let mut all = self.term_nodes(node, "graph")?;
         for one in &mut all {
             if let TermNode::Constant(term @ Term::BlankNode(_)) = one
@@ -59,7 +60,7 @@ impl<'a> Reading<'a> {
         role: &str,
         usual: TermKind,
         scope: &Scope<'_>,
-    ) -> Result<TermMap, String> {
+    ) -> Result<TermMap, TriplesMapFault> {
         let node = match node {
             TermNode::Constant(term) => return constant(term, role),
             TermNode::Map(node) => node,
@@ -76,17 +77,14 @@ impl<'a> Reading<'a> {
             return constant(term, role);
         }
         let expression = self.expression(node, scope)?;
-        let expression = expression.ok_or_else(|| {
-            format!("the {role} map has no constant, template or reference of its own")
-        })?;
+        let expression =
+            expression.ok_or_else(|| TriplesMapFault::NoExpression(role.to_owned()))?;
         let language = self.shared(node, "language", scope)?;
         let datatype = self.shared(node, "datatype", scope)?;
         if let Some(tag) = language.as_ref().and_then(Expression::constant)
             && !is_language(tag)
         {
-            return Err(format!(
-                "`{tag}` is no language tag; use one of BCP 47, such as `en`"
-            ));
+            return Err(TriplesMapFault::Language(tag.to_owned()));
         }
         let is_literal = language.is_some() || datatype.is_some();
         let kind = match self
@@ -98,7 +96,7 @@ impl<'a> Reading<'a> {
             Some((_, Some("UnsafeIRI" | "UnsafeURI"))) => TermKind::UnsafeIri,
             Some((_, Some("BlankNode"))) => TermKind::BlankNode,
             Some((_, Some("Literal"))) => TermKind::Literal,
-            Some((kind, _)) => return Err(format!("unknown term type {kind}")),
+            Some((kind, _)) => return Err(TriplesMapFault::TermType(kind.to_string())),
             None if role == "object" && (is_literal || !expression.is_template) => {
                 TermKind::Literal
             }
@@ -118,12 +116,12 @@ impl<'a> Reading<'a> {
         join: &'a NamedOrBlankNode,
         side: &str,
         scope: &Scope<'_>,
-    ) -> Result<Expression, String> {
+    ) -> Result<Expression, TriplesMapFault> {
         if let Some(written) = self.graph.text(join, side)? {
             return reference(written, scope.namespaces);
         }
         let found = self.shared(join, side, scope)?;
-        found.ok_or_else(|| format!("a join condition has no `{side}`"))
+        found.ok_or_else(|| TriplesMapFault::JoinSide(side.to_owned()))
     }
 
     /// Reads an expression that is given as a constant, or by a map.
@@ -132,11 +130,16 @@ impl<'a> Reading<'a> {
         node: &'a NamedOrBlankNode,
         property: &str,
         scope: &Scope<'_>,
-    ) -> Result<Option<Expression>, String> {
+    ) -> Result<Option<Expression>, TriplesMapFault> {
         let text = match self.graph.one(node, property)? {
             Some(Term::Literal(text)) => Some(text.value()),
             Some(Term::NamedNode(iri)) => Some(iri.as_str()),
-            Some(other) => return Err(format!("`{property}` is no {other}")),
+            Some(other) => {
+                return Err(TriplesMapFault::NoTerm {
+                    property: property.to_owned(),
+                    found: other.to_string(),
+                });
+            }
             None => None,
         };
         if let Some(text) = text {
@@ -159,11 +162,11 @@ impl<'a> Reading<'a> {
         &self,
         node: &NamedOrBlankNode,
         scope: &Scope<'_>,
-    ) -> Result<Option<Expression>, String> {
+    ) -> Result<Option<Expression>, TriplesMapFault> {
         let written = self.graph.text(node, "template")?;
         let reference = self.graph.text(node, "reference")?;
         match (written, reference) {
-            (Some(_), Some(_)) => Err("a map has both a template and a reference".to_owned()),
+            (Some(_), Some(_)) => Err(TriplesMapFault::TwoExpressions),
             (Some(written), None) => template(written, scope.namespaces).map(Some),
             (None, Some(written)) => self::reference(written, scope.namespaces).map(Some),
             (None, None) => Ok(None),
@@ -190,7 +193,7 @@ impl Expression {
     }
 }
 
-fn constant(term: &Term, role: &str) -> Result<TermMap, String> {
+fn constant(term: &Term, role: &str) -> Result<TermMap, TriplesMapFault> {
     let kind = match term {
         Term::NamedNode(_) => TermKind::Iri,
         Term::BlankNode(_) => TermKind::BlankNode,
@@ -202,7 +205,10 @@ fn constant(term: &Term, role: &str) -> Result<TermMap, String> {
         _ => kind != TermKind::Literal,
     };
     if !is_allowed {
-        return Err(format!("the constant {term} cannot be a {role}"));
+        return Err(TriplesMapFault::Constant {
+            term: term.to_string(),
+            role: role.to_owned(),
+        });
     }
     Ok(TermMap {
         value: TermValue::Constant(term.clone()),
@@ -212,9 +218,11 @@ fn constant(term: &Term, role: &str) -> Result<TermMap, String> {
     })
 }
 
-fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, String> {
-    let expr = parse(written, namespaces)
-        .map_err(|problem| format!("the reference `{written}`: {problem}"))?;
+fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, TriplesMapFault> {
+    let expr = parse(written, namespaces).map_err(|fault| TriplesMapFault::Reference {
+        written: written.to_owned(),
+        fault,
+    })?;
     Ok(Expression {
         parts: vec![TemplatePart::Value(expr)],
         is_template: false,
@@ -223,8 +231,11 @@ fn reference(written: &str, namespaces: &Namespaces) -> Result<Expression, Strin
 }
 
 /// Reads a template: texts with expressions in braces. A backslash escapes a brace.
-fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, String> {
-    let fault = |problem: String| format!("the template `{written}`: {problem}");
+fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, TriplesMapFault> {
+    let fault = |fault: TemplateFault| TriplesMapFault::Template {
+        written: written.to_owned(),
+        fault,
+    };
     let mut parts = Vec::new();
     let mut text = String::new();
     let mut inner: Option<String> = None;
@@ -233,7 +244,7 @@ fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, String
         let (character, is_escaped) = match character {
             '\\' => match characters.next() {
                 Some(next) => (next, true),
-                None => return Err(fault("it ends with a backslash".to_owned())),
+                None => return Err(fault(TemplateFault::Backslash)),
             },
             other => (other, false),
         };
@@ -245,22 +256,24 @@ fn template(written: &str, namespaces: &Namespaces) -> Result<Expression, String
                 inner = Some(String::new());
             }
             ('}', false, Some(expression)) => {
-                let expr = parse(expression, namespaces)
-                    .map_err(|problem| fault(format!("`{expression}`: {problem}")))?;
+                let expr = parse(expression, namespaces).map_err(|found| {
+                    fault(TemplateFault::Expression {
+                        written: expression.clone(),
+                        fault: found,
+                    })
+                })?;
                 parts.push(TemplatePart::Value(expr));
                 inner = None;
             }
             ('{' | '}', false, _) => {
-                return Err(fault(format!(
-                    "`{character}` has no counterpart; write \\{character} for the character"
-                )));
+                return Err(fault(TemplateFault::Brace(character)));
             }
             (_, _, Some(expression)) => expression.push(character),
             (_, _, None) => text.push(character),
         }
     }
     if inner.is_some() {
-        return Err(fault("`{` has no counterpart".to_owned()));
+        return Err(fault(TemplateFault::Open));
     }
     if !text.is_empty() {
         parts.push(TemplatePart::Text(text));

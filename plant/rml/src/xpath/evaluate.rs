@@ -19,6 +19,27 @@ pub(crate) struct NodeRef {
     pub(super) attribute: u32,
 }
 
+/// Reason for which an expression has no value.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum EvaluationFault {
+    #[error(
+        "the mapping reads more than {0} nodes and bytes; narrow its paths, for example `/a/b` \
+         instead of `//b`"
+    )]
+    Work(u64),
+    #[error("the iterator is no path")]
+    Iterator,
+    #[error("a path was expected, and not a text, number or truth value")]
+    NoPath,
+    #[error("a value has more than {0} bytes")]
+    Text(usize),
+    #[error(
+        "the prefix `{0}` is declared neither by rml:namespace of the reference formulation, nor \
+         by the root element of the file"
+    )]
+    Prefix(String),
+}
+
 /// The remaining work of a run: visited nodes, and bytes of text.
 #[derive(Debug)]
 pub(crate) struct WorkBudget {
@@ -31,15 +52,10 @@ impl WorkBudget {
         Self { left: most, most }
     }
 
-    pub(crate) fn spend(&mut self, amount: usize) -> Result<(), String> {
+    pub(crate) fn spend(&mut self, amount: usize) -> Evaluated<()> {
         let amount = u64::try_from(amount).unwrap_or(u64::MAX);
-        self.left = self.left.checked_sub(amount).ok_or_else(|| {
-            format!(
-                "the mapping reads more than {} nodes and bytes; narrow its paths, for example \
-                 `/a/b` instead of `//b`",
-                self.most
-            )
-        })?;
+        let left = self.left.checked_sub(amount);
+        self.left = left.ok_or(EvaluationFault::Work(self.most))?;
         Ok(())
     }
 }
@@ -72,7 +88,7 @@ pub(crate) struct Evaluator<'a> {
     tables: HashMap<Arc<str>, Table>,
 }
 
-pub(super) type Evaluated<T> = Result<T, String>;
+pub(crate) type Evaluated<T> = Result<T, EvaluationFault>;
 
 impl<'a> Evaluator<'a> {
     pub(crate) fn new(document: &'a Document<'a>) -> Self {
@@ -89,7 +105,7 @@ impl<'a> Evaluator<'a> {
         match self.evaluate(expr, XPathContext::of(root), work)? {
             XPathValue::Nodes(nodes) => Ok(nodes),
             XPathValue::Text(_) | XPathValue::Number(_) | XPathValue::Boolean(_) => {
-                Err("the iterator is no path".to_owned())
+                Err(EvaluationFault::Iterator)
             }
         }
     }
@@ -162,7 +178,7 @@ impl<'a> Evaluator<'a> {
         match self.evaluate(expr, at, work)? {
             XPathValue::Nodes(nodes) => Ok(nodes),
             XPathValue::Text(_) | XPathValue::Number(_) | XPathValue::Boolean(_) => {
-                Err("a path was expected, and not a text, number or truth value".to_owned())
+                Err(EvaluationFault::NoPath)
             }
         }
     }
@@ -633,10 +649,7 @@ fn in_space(
             let root = document.root_element();
             match root.lookup_namespace_uri(Some(prefix)) {
                 Some(uri) => Ok(namespace == Some(uri)),
-                None => Err(format!(
-                    "the prefix `{prefix}` is declared neither by rml:namespace of the reference \
-                     formulation, nor by the root element of the file"
-                )),
+                None => Err(EvaluationFault::Prefix(prefix.clone())),
             }
         }
     }

@@ -3,6 +3,7 @@
 use std::collections::{HashMap, HashSet};
 
 use super::Comparison;
+use super::evaluate::{Evaluated, EvaluationFault};
 
 pub(super) fn holds<T: PartialOrd>(comparison: Comparison, a: &T, b: &T) -> bool {
     match comparison {
@@ -104,9 +105,9 @@ pub(super) fn of_number(number: f64) -> String {
     (number + 0.0).to_string()
 }
 
-pub(super) fn bounded(text: String) -> Result<String, String> {
+pub(super) fn bounded(text: String) -> Evaluated<String> {
     if text.len() > MAX_TEXT {
-        Err(format!("a value has more than {MAX_TEXT} bytes"))
+        Err(EvaluationFault::Text(MAX_TEXT))
     } else {
         Ok(text)
     }

@@ -2,19 +2,57 @@
 
 use std::sync::Arc;
 
-use super::tokens::{Token, TokenKind, tokens};
+use super::tokens::{Token, TokenFault, TokenKind, tokens};
 use super::{
     Axis, Comparison, Expr, Function, Join, LocationPath, NamespaceTest, Namespaces, Operator,
     PathIndex, Start, Test, XPathStep,
 };
 
+/// Reason for which a text is no expression, with the position and the remedy.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum XPathSyntaxFault {
+    #[error("it has more than {0} bytes")]
+    Length(usize),
+    #[error("{fault} at character {position}")]
+    Token { fault: TokenFault, position: usize },
+    #[error("unexpected {token} at character {position}")]
+    Unexpected { token: String, position: usize },
+    #[error("expected {expected}, and found {token} at character {position}")]
+    Expected {
+        expected: String,
+        token: String,
+        position: usize,
+    },
+    #[error("expected {0} at the end")]
+    ExpectedAtEnd(String),
+    #[error("it nests more than {0} deep")]
+    Depth(usize),
+    #[error("it has more than {0} operators")]
+    Operators(usize),
+    #[error("the path has more than {0} steps")]
+    Steps(usize),
+    #[error("unknown axis `{name}`; known are {known}")]
+    Axis { name: String, known: String },
+    #[error("`{0}(..)` is not a test of a node; a function can only start a path")]
+    NodeTest(String),
+    #[error("unknown function `{name}`; known are {known}")]
+    Function { name: String, known: String },
+    #[error("`{name}` takes from {least} to {most} arguments, and has {given}")]
+    Arguments {
+        name: String,
+        least: usize,
+        most: usize,
+        given: usize,
+    },
+}
+
 /// Parses an expression.
 ///
 /// # Errors
-/// A text that names the position and the remedy.
-pub(crate) fn parse(text: &str, namespaces: &Namespaces) -> Result<Expr, String> {
+/// [`XPathSyntaxFault`].
+pub(crate) fn parse(text: &str, namespaces: &Namespaces) -> Result<Expr, XPathSyntaxFault> {
     if text.len() > MAX_LENGTH {
-        return Err(format!("it has more than {MAX_LENGTH} bytes"));
+        return Err(XPathSyntaxFault::Length(MAX_LENGTH));
     }
     let mut parser = Parser {
         tokens: tokens(text)?,
@@ -26,11 +64,10 @@ pub(crate) fn parse(text: &str, namespaces: &Namespaces) -> Result<Expr, String>
     let expr = parser.expr()?;
     match parser.tokens.get(parser.next) {
         None => Ok(expr),
-        Some(token) => Err(format!(
-            "unexpected {} at character {}",
-            shown(&token.kind),
-            token.position
-        )),
+        Some(token) => Err(XPathSyntaxFault::Unexpected {
+            token: shown(&token.kind),
+            position: token.position,
+        }),
     }
 }
 
@@ -42,7 +79,7 @@ struct Parser<'a> {
     namespaces: &'a Namespaces,
 }
 
-type Parsed<T> = Result<T, String>;
+type Parsed<T> = Result<T, XPathSyntaxFault>;
 
 /// The binary operators by precedence, weakest first.
 const LEVELS: [&[&str]; 7] = [
@@ -61,7 +98,7 @@ impl Parser<'_> {
     fn expr(&mut self) -> Parsed<Expr> {
         self.depth += 1;
         if self.depth > MAX_DEPTH {
-            return Err(format!("it nests more than {MAX_DEPTH} deep"));
+            return Err(XPathSyntaxFault::Depth(MAX_DEPTH));
         }
         let expr = self.level(0);
         self.depth -= 1;
@@ -72,7 +109,7 @@ impl Parser<'_> {
         if level == UNARY && self.take("-") {
             self.depth += 1;
             if self.depth > MAX_DEPTH {
-                return Err(format!("it nests more than {MAX_DEPTH} deep"));
+                return Err(XPathSyntaxFault::Depth(MAX_DEPTH));
             }
             let expr = self.level(UNARY)?;
             self.depth -= 1;
@@ -86,7 +123,7 @@ impl Parser<'_> {
             // The expression nests to the left, and is evaluated by recursion.
             self.operators += 1;
             if self.operators > MAX_OPERATORS {
-                return Err(format!("it has more than {MAX_OPERATORS} operators"));
+                return Err(XPathSyntaxFault::Operators(MAX_OPERATORS));
             }
             let right = self.level(level + 1)?;
             left = binary(symbol, left, right);
@@ -142,7 +179,7 @@ impl Parser<'_> {
     fn steps(&mut self, steps: &mut Vec<XPathStep>) -> Parsed<()> {
         loop {
             if steps.len() >= MAX_DEPTH {
-                return Err(format!("the path has more than {MAX_DEPTH} steps"));
+                return Err(XPathSyntaxFault::Steps(MAX_DEPTH));
             }
             let step = self.step()?;
             steps.push(step);
@@ -191,7 +228,10 @@ impl Parser<'_> {
             .map(|(_, axis)| *axis)
             .ok_or_else(|| {
                 let known: Vec<&str> = AXES.iter().map(|(name, _)| *name).collect();
-                format!("unknown axis `{named}`; known are {}", known.join(", "))
+                XPathSyntaxFault::Axis {
+                    known: known.join(", "),
+                    name: named,
+                }
             })
     }
 
@@ -214,9 +254,7 @@ impl Parser<'_> {
                 "text" => Ok(Test::Text),
                 "comment" => Ok(Test::Comment),
                 "processing-instruction" => Ok(Test::Instruction(target)),
-                _ => Err(format!(
-                    "`{local}(..)` is not a test of a node; a function can only start a path"
-                )),
+                _ => Err(XPathSyntaxFault::NodeTest(local)),
             };
         }
         let space = match prefix {
@@ -269,10 +307,10 @@ impl Parser<'_> {
         let known = known.filter(|_| prefix.is_none_or(|prefix| prefix == "fn"));
         let Some((_, function, least, most)) = known.copied() else {
             let all: Vec<&str> = Function::ALL.iter().map(|(name, ..)| *name).collect();
-            return Err(format!(
-                "unknown function `{name}`; known are {}",
-                all.join(", ")
-            ));
+            return Err(XPathSyntaxFault::Function {
+                name: name.to_owned(),
+                known: all.join(", "),
+            });
         };
         let mut all = Vec::new();
         if !self.take(")") {
@@ -285,10 +323,12 @@ impl Parser<'_> {
             self.expect(")")?;
         }
         if all.len() < least || all.len() > most {
-            return Err(format!(
-                "`{name}` takes from {least} to {most} arguments, and has {}",
-                all.len()
-            ));
+            return Err(XPathSyntaxFault::Arguments {
+                name: name.to_owned(),
+                least,
+                most,
+                given: all.len(),
+            });
         }
         Ok(Expr::Call(function, all))
     }
@@ -324,14 +364,15 @@ impl Parser<'_> {
         }
     }
 
-    fn wrong(&self, expected: &str) -> String {
+    fn wrong(&self, expected: &str) -> XPathSyntaxFault {
+        let expected = expected.to_owned();
         match self.tokens.get(self.next) {
-            Some(token) => format!(
-                "expected {expected}, and found {} at character {}",
-                shown(&token.kind),
-                token.position
-            ),
-            None => format!("expected {expected} at the end"),
+            Some(token) => XPathSyntaxFault::Expected {
+                expected,
+                token: shown(&token.kind),
+                position: token.position,
+            },
+            None => XPathSyntaxFault::ExpectedAtEnd(expected),
         }
     }
 }

@@ -1,5 +1,7 @@
 //! The tokens of an expression (XPath 1.0, 3.7).
 
+use super::parse::XPathSyntaxFault;
+
 /// A token with the position of its first character, from 1.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Token {
@@ -23,8 +25,25 @@ const SYMBOLS: [&str; 21] = [
     ">", ".", "$",
 ];
 
+/// A part of an expression that is no token.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum TokenFault {
+    #[error("the text has no closing {0}")]
+    Unclosed(char),
+    #[error("`{0}` is not a number")]
+    Number(String),
+    #[error("variables are not supported; write the value")]
+    Variable,
+    #[error("unexpected character `{0}`")]
+    Character(char),
+    #[error("an operator is missing before `{0}`")]
+    NoOperator(String),
+    #[error("no name follows the prefix `{0}`")]
+    NoLocalName(String),
+}
+
 /// Splits an expression into tokens.
-pub(super) fn tokens(text: &str) -> Result<Vec<Token>, String> {
+pub(super) fn tokens(text: &str) -> Result<Vec<Token>, XPathSyntaxFault> {
     let mut all: Vec<Token> = Vec::new();
     let mut rest = text;
     loop {
@@ -35,7 +54,7 @@ pub(super) fn tokens(text: &str) -> Result<Vec<Token>, String> {
         let before = text.get(..text.len() - rest.len()).unwrap_or_default();
         let position = before.chars().count() + 1;
         let (kind, after) = one(rest, first, all.last().map(|token| &token.kind))
-            .map_err(|problem| format!("{problem} at character {position}"))?;
+            .map_err(|fault| XPathSyntaxFault::Token { fault, position })?;
         all.push(Token { kind, position });
         rest = after;
     }
@@ -45,12 +64,10 @@ fn one<'a>(
     rest: &'a str,
     first: char,
     before: Option<&TokenKind>,
-) -> Result<(TokenKind, &'a str), String> {
+) -> Result<(TokenKind, &'a str), TokenFault> {
     if let quote @ ('"' | '\'') = first {
         let inner = rest.get(1..).unwrap_or_default();
-        let (text, after) = inner
-            .split_once(quote)
-            .ok_or_else(|| format!("the text has no closing {quote}"))?;
+        let (text, after) = inner.split_once(quote).ok_or(TokenFault::Unclosed(quote))?;
         return Ok((TokenKind::Text(text.to_owned()), after));
     }
     let fraction = rest.strip_prefix('.').and_then(|rest| rest.chars().next());
@@ -59,7 +76,7 @@ fn one<'a>(
         let (number, after) = rest.split_at(end.unwrap_or(rest.len()));
         let number = number
             .parse()
-            .map_err(|_| format!("`{number}` is not a number"))?;
+            .map_err(|_| TokenFault::Number(number.to_owned()))?;
         return Ok((TokenKind::Number(number), after));
     }
     if first == '*' {
@@ -72,18 +89,18 @@ fn one<'a>(
     }
     if let Some(symbol) = SYMBOLS.iter().find(|symbol| rest.starts_with(**symbol)) {
         if *symbol == "$" {
-            return Err("variables are not supported; write the value".to_owned());
+            return Err(TokenFault::Variable);
         }
         return Ok((
             TokenKind::Symbol(symbol),
             rest.get(symbol.len()..).unwrap_or_default(),
         ));
     }
-    let (name, after) = name(rest).ok_or_else(|| format!("unexpected character `{first}`"))?;
+    let (name, after) = name(rest).ok_or(TokenFault::Character(first))?;
     if ends_operand(before) {
         let operator = ["and", "or", "div", "mod"];
         let Some(operator) = operator.into_iter().find(|operator| *operator == name) else {
-            return Err(format!("an operator is missing before `{name}`"));
+            return Err(TokenFault::NoOperator(name.to_owned()));
         };
         return Ok((TokenKind::Symbol(operator), after));
     }
@@ -99,7 +116,7 @@ fn one<'a>(
             ));
         }
         let (local, after) =
-            self::name(local).ok_or_else(|| format!("no name follows the prefix `{name}`"))?;
+            self::name(local).ok_or_else(|| TokenFault::NoLocalName(name.to_owned()))?;
         return Ok((
             TokenKind::Name(Some(name.to_owned()), local.to_owned()),
             after,
