@@ -5,31 +5,63 @@ use messages::Rank;
 use serde_json::{Map, Value};
 use uadp::BuiltinType;
 
+/// Reason for which the text of a form is no value, for the user.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum FormFault {
+    #[error("the call has no field `{0}`")]
+    UnknownField(String),
+    #[error("`{0}` is missing")]
+    Missing(String),
+    #[error("too many fields")]
+    Fields,
+    #[error("`{field}`: {fault}")]
+    Field { field: String, fault: EntryFault },
+    #[error(transparent)]
+    Entry(#[from] EntryFault),
+}
+
+/// Reason for which a text is no value of a type.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum EntryFault {
+    #[error("too many elements")]
+    Elements,
+    #[error("{wanted} elements are wanted, not {given}")]
+    Length { wanted: u32, given: i32 },
+    #[error("`{text}` is no {kind}")]
+    Text { text: String, kind: &'static str },
+    #[error("a {0} cannot be entered here")]
+    Unsupported(&'static str),
+}
+
 /// Encodes the request of a call. `given` has a text, a number or a list for each field.
 ///
 /// # Errors
-/// Returns the fault of a field as text for the user.
+/// Returns the fault of a field.
 pub(crate) fn request(
     call: &CallDescription,
     given: &Map<String, Value>,
-) -> Result<Vec<u8>, String> {
+) -> Result<Vec<u8>, FormFault> {
     let is_known = |name: &&String| call.request.iter().all(|field| field.name != **name);
     if let Some(unknown) = given.keys().find(is_known) {
-        return Err(format!("the call has no field `{unknown}`"));
+        return Err(FormFault::UnknownField(unknown.clone()));
     }
     // A request without fields uses all defaults.
     if given.is_empty() && call.may_be_empty() {
         return Ok(vec![0, 0]);
     }
-    let count = u16::try_from(call.request.len()).map_err(|_| "too many fields".to_owned())?;
+    let count = u16::try_from(call.request.len()).map_err(|_| FormFault::Fields)?;
     let mut block = Vec::from(count.to_le_bytes());
     for field in &call.request {
         match given.get(&field.name) {
-            Some(value) => variant(field, value, &mut block)
-                .map_err(|fault| format!("`{}`: {fault}", field.name))?,
+            Some(value) => {
+                variant(field, value, &mut block).map_err(|fault| FormFault::Field {
+                    field: field.name.clone(),
+                    fault,
+                })?;
+            }
             // The null Variant stands for the default.
             None if field.optional => block.push(0),
-            None => return Err(format!("`{}` is missing", field.name)),
+            None => return Err(FormFault::Missing(field.name.clone())),
         }
     }
     Ok(block)
@@ -38,14 +70,14 @@ pub(crate) fn request(
 /// Encodes the value of a variable with a single field.
 ///
 /// # Errors
-/// Returns the fault as text for the user.
-pub(crate) fn value(field: &CallField, given: &Value) -> Result<Vec<u8>, String> {
+/// Returns the fault of the value.
+pub(crate) fn value(field: &CallField, given: &Value) -> Result<Vec<u8>, FormFault> {
     let mut block = vec![1, 0];
     variant(field, given, &mut block)?;
     Ok(block)
 }
 
-fn variant(field: &CallField, value: &Value, block: &mut Vec<u8>) -> Result<(), String> {
+fn variant(field: &CallField, value: &Value, block: &mut Vec<u8>) -> Result<(), EntryFault> {
     let Rank::Array { fixed } = field.rank else {
         block.push(field.builtin.id());
         return scalar(field.builtin, &text(value), block);
@@ -65,11 +97,14 @@ fn variant(field: &CallField, value: &Value, block: &mut Vec<u8>) -> Result<(), 
             }
         }
     };
-    let length = i32::try_from(elements.len()).map_err(|_| "too many elements".to_owned())?;
+    let length = i32::try_from(elements.len()).map_err(|_| EntryFault::Elements)?;
     if let Some(fixed) = fixed
         && u32::try_from(length) != Ok(fixed)
     {
-        return Err(format!("{fixed} elements are wanted, not {length}"));
+        return Err(EntryFault::Length {
+            wanted: fixed,
+            given: length,
+        });
     }
     block.push(field.builtin.id() | ARRAY);
     block.extend(length.to_le_bytes());
@@ -92,8 +127,11 @@ fn text(value: &Value) -> String {
     clippy::wildcard_enum_match_arm,
     reason = "the other types have no text that people enter"
 )]
-fn scalar(builtin: BuiltinType, text: &str, block: &mut Vec<u8>) -> Result<(), String> {
-    let fault = || format!("`{}` is no {}", crate::value::cut(text, 40), builtin.name());
+fn scalar(builtin: BuiltinType, text: &str, block: &mut Vec<u8>) -> Result<(), EntryFault> {
+    let fault = || EntryFault::Text {
+        text: crate::value::cut(text, 40),
+        kind: builtin.name(),
+    };
     let trimmed = text.trim();
     match builtin {
         BuiltinType::Boolean => {
@@ -125,17 +163,20 @@ fn scalar(builtin: BuiltinType, text: &str, block: &mut Vec<u8>) -> Result<(), S
             block.extend(length.to_le_bytes());
             block.extend(text.as_bytes());
         }
-        other => return Err(format!("a {} cannot be entered here", other.name())),
+        other => return Err(EntryFault::Unsupported(other.name())),
     }
     Ok(())
 }
 
-fn number<T: std::str::FromStr>(text: &str, fault: impl Fn() -> String) -> Result<T, String> {
+fn number<T: std::str::FromStr>(
+    text: &str,
+    fault: impl Fn() -> EntryFault,
+) -> Result<T, EntryFault> {
     text.parse().map_err(|_| fault())
 }
 
 /// A machine takes no infinite numbers from a form.
-fn finite<T>(is_finite: bool, value: T, fault: impl Fn() -> String) -> Result<T, String> {
+fn finite<T>(is_finite: bool, value: T, fault: impl Fn() -> EntryFault) -> Result<T, EntryFault> {
     is_finite.then_some(value).ok_or_else(fault)
 }
 
@@ -159,7 +200,8 @@ mod tests {
     }
 
     fn encoded(request: Vec<CallField>, given: &Value) -> Result<Vec<u8>, String> {
-        super::request(&call(request), given.as_object().unwrap())
+        let block = super::request(&call(request), given.as_object().unwrap());
+        block.map_err(|fault| fault.to_string())
     }
 
     #[test]

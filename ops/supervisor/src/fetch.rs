@@ -80,9 +80,9 @@ impl StatusUrl {
         let response = self.send(request, (MOST_BYTES, LIMIT)).await;
         let response = response.map_err(|fault| fault.to_string())?;
         if !response.status().is_success() {
-            return Err(format!("the response is {}", response.status()));
+            return Err(FetchFault::Response(response.status()));
         }
-        serde_json::from_slice(response.body()).map_err(|error| format!("no status: {error}"))
+        serde_json::from_slice(response.body()).map_err(FetchFault::Status)
     }
 
     /// Sends a request to the program. Returns the response, whose body has at most `most` bytes.
@@ -154,7 +154,7 @@ mod tests {
         let (status, ()) = tokio::join!(url.fetch(), serve);
         assert_eq!(status.unwrap()["space"], 1);
         drop(listener);
-        let why = url.fetch().await.unwrap_err();
+        let why = url.fetch().await.unwrap_err().to_string();
         assert!(why.starts_with("no connection"), "{why}");
     }
 }

@@ -228,7 +228,8 @@ async fn follow(page: Weak<Page>, statuses: Statuses) {
         }
         let mut programs = own(statuses().await);
         for url in &page.others {
-            programs.extend(other(url, url.fetch().await));
+            let status = url.fetch().await.map_err(|fault| fault.to_string());
+            programs.extend(other(url, status));
         }
         page.board().set_programs(programs);
     }

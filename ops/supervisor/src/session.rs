@@ -23,19 +23,21 @@ pub(crate) struct Session {
     began: Duration,
 }
 
+/// Too many attempts to sign in have failed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("too many attempts have failed: try again in {} s", LOCKED_FOR.as_secs())]
+pub(crate) struct Locked;
+
 impl Sessions {
     /// Checks whether a user may attempt to sign in.
     ///
     /// # Errors
-    /// Returns the reason as text: too many attempts have failed.
-    pub(crate) fn may_try(&mut self, user: &str, now: Duration) -> Result<(), String> {
+    /// Returns [`Locked`] if too many attempts have failed.
+    pub(crate) fn may_try(&mut self, user: &str, now: Duration) -> Result<(), Locked> {
         self.failed.retain(|(at, _)| now < *at + LOCKED_FOR);
         let of_user = self.failed.iter().filter(|(_, failed)| failed == user);
         if of_user.count() >= MOST_FAILED_OF_USER || self.failed.len() >= MOST_FAILED {
-            let seconds = LOCKED_FOR.as_secs();
-            return Err(format!(
-                "too many attempts have failed: try again in {seconds} s"
-            ));
+            return Err(Locked);
         }
         Ok(())
     }

@@ -164,8 +164,7 @@ impl Page {
             "/events" => {
                 check_reader(&browser)?;
                 let query = request.uri().query().unwrap_or_default();
-                let view =
-                    View::parse(query).map_err(|why| Refusal::new(StatusCode::BAD_REQUEST, why))?;
+                let view = View::parse(query).map_err(bad_request)?;
                 let worker = self.worker().ok_or_else(|| {
                     let why = "the system refuses another thread";
                     Refusal::new(StatusCode::SERVICE_UNAVAILABLE, why)
@@ -260,7 +259,8 @@ impl Page {
     ) -> Result<Response<PageBody>, Refusal> {
         let now = self.at().since;
         let may_try = self.sessions().may_try(&user, now);
-        may_try.map_err(|why| Refusal::new(StatusCode::TOO_MANY_REQUESTS, why))?;
+        may_try
+            .map_err(|locked| Refusal::new(StatusCode::TOO_MANY_REQUESTS, locked.to_string()))?;
         // Counted before the check, so that attempts at the same time are limited too.
         self.sessions().fail(&user, now);
         let shown = value::cut(&user, 64);
@@ -520,11 +520,11 @@ fn change_condition(
 
 fn parse_topic(text: &str) -> Result<TopicId, Refusal> {
     text.parse()
-        .map_err(|_| bad_request("a topic is wanted, as ua_0_7_105".to_owned()))
+        .map_err(|_| bad_request("a topic is wanted, as ua_0_7_105"))
 }
 
-fn bad_request(why: String) -> Refusal {
-    Refusal(StatusCode::BAD_REQUEST, why)
+fn bad_request(why: impl std::fmt::Display) -> Refusal {
+    Refusal(StatusCode::BAD_REQUEST, why.to_string())
 }
 
 /// Returns the outcome of a command for the log.

@@ -1,7 +1,7 @@
 //! Values of the space as text and numbers for the page.
 
 use serde_json::{Value, json};
-use uadp::{Array, ExtensionBody, Fields, Identifier, NodeId, Scalar, Variant};
+use uadp::{Array, DecodeError, ExtensionBody, Fields, Identifier, NodeId, Scalar, Variant};
 
 /// Returns the fields of a block in order with their `names`; a field without a name is `field_1`
 /// and so on.
@@ -9,13 +9,12 @@ use uadp::{Array, ExtensionBody, Fields, Identifier, NodeId, Scalar, Variant};
 /// The result is bounded: long arrays and texts are cut, and end with `…`.
 ///
 /// # Errors
-/// Returns the reason as text if the block is malformed.
-pub(crate) fn fields(block: &[u8], names: &[String]) -> Result<Vec<(String, Value)>, String> {
+/// Returns the reason if the block is malformed.
+pub(crate) fn fields(block: &[u8], names: &[String]) -> Result<Vec<(String, Value)>, DecodeError> {
     let mut shown = Vec::new();
-    let fields = Fields::parse(block).map_err(|error| error.to_string())?;
+    let fields = Fields::parse(block)?;
     for (index, field) in fields.enumerate().take(MOST_FIELDS) {
-        let field = field.map_err(|error| error.to_string())?;
-        shown.push((name(names, index), variant(&field)));
+        shown.push((name(names, index), variant(&field?)));
     }
     Ok(shown)
 }

@@ -12,6 +12,19 @@ use crate::operations;
 use crate::skill;
 use crate::value;
 
+/// The query of an event stream names no view.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum ViewFault {
+    #[error("{key}={text}: a number is wanted")]
+    Number { key: &'static str, text: String },
+    #[error("topic={0}: a topic is wanted, as ua_1_2_10")]
+    Topic(String),
+    #[error(
+        "view={0}: there are programs, values, topic, map, skills, processes, alarms and events"
+    )]
+    View(String),
+}
+
 /// The view that a browser shows.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum View {
@@ -64,18 +77,19 @@ impl View {
     /// Parses the query of the event stream, as `view=values&from=0&count=40`.
     ///
     /// # Errors
-    /// Returns the fault as text.
-    pub(crate) fn parse(query: &str) -> Result<Self, String> {
+    /// Returns the fault of a parameter.
+    pub(crate) fn parse(query: &str) -> Result<Self, ViewFault> {
         let pairs = pairs(query);
         let get = |key: &str| {
             let found = pairs.iter().find(|(name, _)| name == key);
             found.map(|(_, value)| value.as_str())
         };
-        let number = |key: &str, default: usize| match get(key) {
+        let number = |key: &'static str, default: usize| match get(key) {
             None => Ok(default),
-            Some(text) => text
-                .parse()
-                .map_err(|_| format!("{key}={text}: a number is wanted")),
+            Some(text) => text.parse().map_err(|_| ViewFault::Number {
+                key,
+                text: text.to_owned(),
+            }),
         };
         Ok(match get("view").unwrap_or_default() {
             "programs" => Self::Programs,
@@ -87,7 +101,7 @@ impl View {
             }),
             "topic" => {
                 let topic = get("topic").unwrap_or_default();
-                let fault = |_| format!("topic={topic}: a topic is wanted, as ua_1_2_10");
+                let fault = |_| ViewFault::Topic(topic.to_owned());
                 Self::Topic(topic.parse().map_err(fault)?)
             }
             "map" => Self::Map,
