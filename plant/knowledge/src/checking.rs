@@ -17,7 +17,7 @@ use crate::http::{Refusal, Site, content, json_page};
 use crate::lanes::Lane;
 use crate::query::{Asked, Dataset, Formats, QueryFault, Results};
 use crate::shapes::{Check, Report, Shapes, Violation};
-use crate::store::Knowledge;
+use crate::store::{Knowledge, KnowledgeFault};
 
 impl Site {
     /// Checks the knowledge against the shapes. The report is Turtle, or JSON if that is accepted.
@@ -31,7 +31,7 @@ impl Site {
         let knowledge = Arc::clone(self.queries.knowledge());
         let reading = tokio::task::spawn_blocking(move || compiled(&knowledge));
         let read = reading.await.map_err(|error| failed(error.to_string()))?;
-        let (shapes, checks, unchecked) = read.map_err(failed)?;
+        let (shapes, checks, unchecked) = read.map_err(|fault| failed(fault.to_string()))?;
         let mut report = Report {
             unchecked,
             ..Report::default()
@@ -58,7 +58,7 @@ impl Site {
                     let each = size_of_each(&check);
                     let reading = tokio::task::spawn_blocking(move || violations_in(&check, &rows));
                     let read = reading.await.map_err(|error| failed(error.to_string()))?;
-                    let found = read.map_err(failed)?;
+                    let found = read.map_err(|error| failed(error.to_string()))?;
                     size += found.len() * each;
                     report.violations.extend(found);
                 }
@@ -78,8 +78,8 @@ impl Site {
 type Compiled = (Shapes, Vec<Check>, Vec<String>);
 
 /// Reads and compiles the shapes, which takes long for many of them.
-fn compiled(knowledge: &Knowledge) -> Result<Compiled, String> {
-    let shapes = Shapes::of(knowledge).map_err(|fault| fault.to_string())?;
+fn compiled(knowledge: &Knowledge) -> Result<Compiled, KnowledgeFault> {
+    let shapes = Shapes::of(knowledge)?;
     let (checks, unchecked) = shapes.checks();
     Ok((shapes, checks, unchecked))
 }
@@ -136,8 +136,8 @@ struct Found {
 }
 
 /// Reads the violations of a constraint, which takes long for a large result.
-fn violations_in(check: &Check, json: &[u8]) -> Result<Vec<Violation>, String> {
-    let read: Solutions = serde_json::from_slice(json).map_err(|error| error.to_string())?;
+fn violations_in(check: &Check, json: &[u8]) -> serde_json::Result<Vec<Violation>> {
+    let read: Solutions = serde_json::from_slice(json)?;
     let rows = read.results.bindings.into_iter();
     Ok(rows.filter_map(|row| violation(check, row)).collect())
 }

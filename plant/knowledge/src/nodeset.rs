@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use mtp::{Object, Triple, escaped};
 use quick_xml::XmlVersion;
 use quick_xml::escape::resolve_predefined_entity;
+use quick_xml::events::attributes::AttrError;
 use quick_xml::events::{BytesStart, Event};
 use quick_xml::reader::Reader;
 use thiserror::Error;
@@ -74,7 +75,9 @@ pub fn read(xml: &str) -> Result<NodeSet, NodeSetFault> {
             what,
         };
         match event.map_err(|error| fault(error.to_string()))? {
-            Event::Start(start) => reading.open(&start).map_err(fault)?,
+            Event::Start(start) => reading
+                .open(&start)
+                .map_err(|error| fault(error.to_string()))?,
             Event::End(_) => reading.close(),
             Event::Text(text) => reading.text.push_str(&text.xml10_content()),
             Event::CData(text) => reading.text.push_str(&text.xml10_content()),
@@ -127,28 +130,36 @@ struct UaNode {
     references: Vec<(String, bool, String)>,
 }
 
+/// Reason for which an element of a NodeSet cannot be read.
+#[derive(Debug, Error)]
+enum NodeFault {
+    #[error("elements nest more than {0} deep")]
+    Depth(usize),
+    #[error("there are more than {0} nodes")]
+    Number(usize),
+    #[error(transparent)]
+    Attribute(#[from] AttrError),
+    #[error(transparent)]
+    Value(#[from] quick_xml::Error),
+}
+
 impl Reading {
-    fn open(&mut self, start: &BytesStart<'_>) -> Result<(), String> {
+    fn open(&mut self, start: &BytesStart<'_>) -> Result<(), NodeFault> {
         if self.open.len() >= MAX_DEPTH {
-            return Err(format!("elements nest more than {MAX_DEPTH} deep"));
+            return Err(NodeFault::Depth(MAX_DEPTH));
         }
-        let text = |name: &str| -> Result<String, String> {
-            let attribute = start
-                .try_get_attribute(name)
-                .map_err(|error| error.to_string())?;
-            let Some(attribute) = attribute else {
+        let text = |name: &str| -> Result<String, NodeFault> {
+            let Some(attribute) = start.try_get_attribute(name)? else {
                 return Ok(String::new());
             };
-            let value = attribute
-                .normalized_value(XmlVersion::Implicit1_0)
-                .map_err(|error| error.to_string())?;
+            let value = attribute.normalized_value(XmlVersion::Implicit1_0)?;
             Ok(value.into_owned())
         };
         let name = start.local_name().into_inner().to_owned();
         match (self.open.len(), name.as_str()) {
             (1, class) if CLASSES.contains(&class) => {
                 if self.nodes.len() >= MAX_NODES {
-                    return Err(format!("there are more than {MAX_NODES} nodes"));
+                    return Err(NodeFault::Number(MAX_NODES));
                 }
                 self.nodes.push(UaNode {
                     class: class.trim_start_matches("UA").to_owned(),

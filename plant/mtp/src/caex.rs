@@ -1,9 +1,8 @@
 //! CAEX (IEC 62424): the tree of elements in the file, without their meaning.
 
-use std::borrow::Cow;
-
 use quick_xml::XmlVersion;
 use quick_xml::escape::resolve_predefined_entity;
+use quick_xml::events::attributes::AttrError;
 use quick_xml::events::{BytesStart, Event};
 use quick_xml::reader::Reader;
 use thiserror::Error;
@@ -90,7 +89,8 @@ impl CaexElement {
             match event.map_err(|error| fault(error.to_string()))? {
                 Event::Start(element) => {
                     let line = lines.at(start);
-                    building.open(&element, line).map_err(fault)?;
+                    let opened = building.open(&element, line);
+                    opened.map_err(|error| fault(error.to_string()))?;
                 }
                 Event::End(_) => building.close(),
                 Event::Text(text) => building.text(&text.xml10_content()),
@@ -165,26 +165,34 @@ enum Part {
     Other,
 }
 
+/// Reason for which an element cannot be read.
+#[derive(Debug, Error)]
+enum ElementFault {
+    #[error("elements nest more than {0} deep")]
+    Depth(usize),
+    #[error("there are more than {0} elements")]
+    Number(usize),
+    #[error(transparent)]
+    Attribute(#[from] AttrError),
+    #[error(transparent)]
+    Value(#[from] quick_xml::Error),
+}
+
 impl Building {
-    fn open(&mut self, start: &BytesStart<'_>, line: usize) -> Result<(), String> {
+    fn open(&mut self, start: &BytesStart<'_>, line: usize) -> Result<(), ElementFault> {
         if self.open.len() >= MAX_DEPTH {
-            return Err(format!("elements nest more than {MAX_DEPTH} deep"));
+            return Err(ElementFault::Depth(MAX_DEPTH));
         }
         self.elements += 1;
         if self.elements > MAX_ELEMENTS {
-            return Err(format!("there are more than {MAX_ELEMENTS} elements"));
+            return Err(ElementFault::Number(MAX_ELEMENTS));
         }
-        let text = |name: &str| -> Result<String, String> {
-            let attribute = start
-                .try_get_attribute(name)
-                .map_err(|error| error.to_string())?;
-            let Some(attribute) = attribute else {
+        let text = |name: &str| -> Result<String, ElementFault> {
+            let Some(attribute) = start.try_get_attribute(name)? else {
                 return Ok(String::new());
             };
-            let value = attribute.normalized_value(XmlVersion::Implicit1_0);
-            value
-                .map(Cow::into_owned)
-                .map_err(|error| error.to_string())
+            let value = attribute.normalized_value(XmlVersion::Implicit1_0)?;
+            Ok(value.into_owned())
         };
         let tag = start.local_name().into_inner();
         let part = match tag {

@@ -5,6 +5,17 @@ use oxigraph::model::{NamedNode, NamedOrBlankNode, Term};
 use super::{SHACL, Shapes, resource};
 use crate::vocabulary::RDFS_SUB_CLASS_OF;
 
+/// Reason for which the targets of a shape are not checked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+enum TargetFault {
+    #[error("its sh:{0} is no IRI")]
+    Term(&'static str),
+    #[error("its sh:targetNode is a blank node")]
+    BlankNode,
+    #[error("sh:{0} is not supported")]
+    Unsupported(&'static str),
+}
+
 /// A constraint with the query for its violations.
 #[derive(Debug, Clone)]
 pub(crate) struct Check {
@@ -194,17 +205,17 @@ impl Shapes {
     }
 
     /// Returns the patterns of the targets of a shape.
-    fn targets(&self, shape: &NamedOrBlankNode) -> Result<Vec<String>, String> {
+    fn targets(&self, shape: &NamedOrBlankNode) -> Result<Vec<String>, TargetFault> {
         let mut targets = Vec::new();
         for class in self.all(shape, "targetClass") {
-            let class = named(class).ok_or("its sh:targetClass is no IRI")?;
+            let class = named(class).ok_or(TargetFault::Term("targetClass"))?;
             targets.push(format!("{{ ?this a {class} }}"));
             let sub_class = format!("<{RDFS_SUB_CLASS_OF}> {class}");
             targets.push(format!("{{ ?this a ?sub . ?sub {sub_class} }}"));
         }
         for node in self.all(shape, "targetNode") {
             if matches!(node, Term::BlankNode(_)) {
-                return Err("its sh:targetNode is a blank node".to_owned());
+                return Err(TargetFault::BlankNode);
             }
             targets.push(format!("{{ VALUES ?this {{ {node} }} }}"));
         }
@@ -213,15 +224,14 @@ impl Shapes {
             ("targetObjectsOf", "?other PREDICATE ?this"),
         ] {
             for predicate in self.all(shape, term) {
-                let predicate =
-                    named(predicate).ok_or_else(|| format!("its sh:{term} is no IRI"))?;
+                let predicate = named(predicate).ok_or(TargetFault::Term(term))?;
                 let pattern = pattern.replace("PREDICATE", &predicate);
                 targets.push(format!("{{ {pattern} }}"));
             }
         }
         for unsupported in ["target", "targetWhere"] {
             if self.one(shape, unsupported).is_some() {
-                return Err(format!("sh:{unsupported} is not supported"));
+                return Err(TargetFault::Unsupported(unsupported));
             }
         }
         Ok(targets)
