@@ -253,9 +253,10 @@ impl<'a> DataSetMessage<'a> {
 
 impl<'a> FieldValues<'a> {
     fn read(&mut self) -> Result<FieldValue<'a>, DecodeError> {
-        let index = match self.indexed {
-            true => self.reader.u16("FieldIndex")?,
-            false => self.next,
+        let index = if self.indexed {
+            self.reader.u16("FieldIndex")?
+        } else {
+            self.next
         };
         self.next = self.next.wrapping_add(1);
         let value = match self.encoding {
@@ -569,9 +570,10 @@ fn read_kind(kind: u8) -> Result<MessageKind, DecodeError> {
 /// to the shortest Ethernet frame.
 #[inline]
 pub(crate) fn check_padding(rest: &[u8]) -> Result<(), DecodeError> {
-    match rest.iter().all(|byte| *byte == 0) {
-        true => Ok(()),
-        false => Err(DecodeError::TrailingBytes(rest.len())),
+    if rest.iter().all(|byte| *byte == 0) {
+        Ok(())
+    } else {
+        Err(DecodeError::TrailingBytes(rest.len()))
     }
 }
 

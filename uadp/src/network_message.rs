@@ -127,9 +127,10 @@ impl<'a> NetworkMessage<'a> {
         if flags.extended1 & header::PICOSECONDS != 0 {
             reader.bytes(2, "PicoSeconds")?;
         }
-        let rest = match flags.extended1 & header::SECURITY != 0 || flags.extended2 != 0 {
-            true => Some(Rest::read(flags, &mut reader)?),
-            false => None,
+        let rest = if flags.extended1 & header::SECURITY != 0 || flags.extended2 != 0 {
+            Some(Rest::read(flags, &mut reader)?)
+        } else {
+            None
         };
         let footer = rest.as_ref().map_or(0, |rest| rest.footer.len());
         Ok(Self {

@@ -132,9 +132,10 @@ impl<'a> Variant<'a> {
                 array.write(out)
             }
             Self::Matrix(matrix) => {
-                let form = match matrix.has_dimensions() {
-                    true => MATRIX,
-                    false => ARRAY,
+                let form = if matrix.has_dimensions() {
+                    MATRIX
+                } else {
+                    ARRAY
                 };
                 out.push(matrix.elements.element.id() | form);
                 matrix.write(out)
@@ -363,9 +364,10 @@ impl<'a> Array<'a> {
 
     /// Appends the Int32 length and the elements.
     pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
-        let length = match self.null {
-            true => writer::NULL_LENGTH,
-            false => writer::int32_length(self.len, "array")?,
+        let length = if self.null {
+            writer::NULL_LENGTH
+        } else {
+            writer::int32_length(self.len, "array")?
         };
         out.reserve(length.len() + self.bytes.len());
         out.extend_from_slice(&length);

@@ -108,10 +108,7 @@ pub(crate) fn patch<const N: usize>(out: &mut [u8], at: usize, value: [u8; N]) {
 /// Returns `bit` if the field is present, otherwise 0.
 #[inline]
 pub(crate) const fn flag(present: bool, bit: u8) -> u8 {
-    match present {
-        true => bit,
-        false => 0,
-    }
+    if present { bit } else { 0 }
 }
 
 /// Length of a null String, ByteString or array.

@@ -93,9 +93,10 @@ mod other_stacks {
                 none if none.is_empty() => vec![format!("{:?}", Scalar::UInt32(0x0403_0201))],
                 fields => fields.iter().map(|field| said(&field["value"])).collect(),
             };
-            let dialects = match json["contested"].is_string() {
-                true => &DIALECTS[1..],
-                false => &DIALECTS[..],
+            let dialects = if json["contested"].is_string() {
+                &DIALECTS[1..]
+            } else {
+                &DIALECTS[..]
             };
             for dialect in dialects {
                 assert_eq!(found(&layout, &datagram, *dialect), expected, "{name}");

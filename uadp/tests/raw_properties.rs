@@ -36,9 +36,10 @@ enum Form {
 
 impl Form {
     fn of(dialect: RawDialect) -> Self {
-        match dialect == Standard {
-            true => Self::Standard,
-            false => Self::Open62541,
+        if dialect == Standard {
+            Self::Standard
+        } else {
+            Self::Open62541
         }
     }
 
@@ -109,12 +110,13 @@ fn field(tape: &mut Tape, depth: u8) -> RawField<'static> {
             let dimensions: Vec<_> = (0..rank).map(|_| u32::from(tape.pick(4))).collect();
             let known = tape.pick(4) != 1;
             let field = field.with_dimensions(dimensions.leak());
-            match known {
-                true => field,
-                false => RawField {
+            if known {
+                field
+            } else {
+                RawField {
                     array_dimensions: &[],
                     ..field
-                },
+                }
             }
         }
         _ => field,
@@ -132,9 +134,10 @@ fn structure(tape: &mut Tape, depth: u8) -> &'static RawStructure<'static> {
         .map(|_| {
             let field = field(tape, depth);
             let may = structure_type == RawStructureType::StructureWithOptionalFields;
-            match may && tape.pick(2) == 1 {
-                true => field.as_optional(),
-                false => field,
+            if may && tape.pick(2) == 1 {
+                field.as_optional()
+            } else {
+                field
             }
         })
         .collect();
@@ -288,9 +291,10 @@ fn lay_out(tree: &Tree, field: &RawField<'_>, form: Form, out: &mut Vec<u8>) {
     if dimensions.len() > 1 && form != Form::Open62541 {
         out.extend(u32::try_from(dimensions.len()).unwrap().to_le_bytes());
     }
-    match null {
-        true => out.extend([0xFF; 4]),
-        false => out.extend(dimensions.iter().flat_map(|size| size.to_le_bytes())),
+    if *null {
+        out.extend([0xFF; 4])
+    } else {
+        out.extend(dimensions.iter().flat_map(|size| size.to_le_bytes()))
     }
     let end = out.len() + full(field, form).unwrap_or(0);
     for leaf in items {

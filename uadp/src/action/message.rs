@@ -169,9 +169,10 @@ impl<'a> ActionFields<'a> {
                 Ok(Self::Variants(block))
             }
             ActionEncoding::RawData => Ok(Self::RawData {
-                count: match counted {
-                    true => Some(reader.u16("FieldCount")?),
-                    false => None,
+                count: if counted {
+                    Some(reader.u16("FieldCount")?)
+                } else {
+                    None
                 },
                 payload: reader.take_rest(),
             }),
@@ -319,12 +320,15 @@ impl<'a> Of<'a> {
         if flags1 & message::VALID == 0 {
             return Err(DecodeError::Misread("marked as invalid by its sender"));
         }
-        let (head, ()) = Head::read(flags1, reader, |kind| match kind == self.kind() {
-            true => Ok(()),
-            false => Err(DecodeError::Reserved {
-                field: "DataSetMessage type under an ActionHeader",
-                value: kind.into(),
-            }),
+        let (head, ()) = Head::read(flags1, reader, |kind| {
+            if kind == self.kind() {
+                Ok(())
+            } else {
+                Err(DecodeError::Reserved {
+                    field: "DataSetMessage type under an ActionHeader",
+                    value: kind.into(),
+                })
+            }
         })?;
         match flags1 & message::FIELD_ENCODING {
             0 => Ok((head, ActionEncoding::Variant)),

@@ -401,9 +401,10 @@ impl Requestor {
                 Phase::Asking {
                     deadline, silent, ..
                 } if now >= deadline.min(silent) => {
-                    let why = match now >= deadline {
-                        true => Unknown::Deadline,
-                        false => Unknown::Silent,
+                    let why = if now >= deadline {
+                        Unknown::Deadline
+                    } else {
+                        Unknown::Silent
                     };
                     self.given_up.push_back((CallId(id), why));
                     self.counters.unknown += 1;
@@ -432,9 +433,10 @@ impl Requestor {
                     ActionDialect::UaNetStandard(_) => None,
                 };
                 let left = deadline.saturating_sub(now).as_secs_f64() * 1000.0;
-                let left = match call.fields.as_fields().bytes().len() > self.settings.large {
-                    true => *hint.get_or_insert(left),
-                    false => left,
+                let left = if call.fields.as_fields().bytes().len() > self.settings.large {
+                    *hint.get_or_insert(left)
+                } else {
+                    left
                 };
                 (ActionState::Executing, Some(left))
             }
@@ -520,9 +522,10 @@ impl Requestor {
                 self.forget(id);
                 Ok(Heard::Closed(CallId(id)))
             }
-            (Phase::Closing { given_up, .. }, ActionState::Done) => Err(match *given_up {
-                true => ResponseDrop::Late,
-                false => ResponseDrop::Repeated,
+            (Phase::Closing { given_up, .. }, ActionState::Done) => Err(if *given_up {
+                ResponseDrop::Late
+            } else {
+                ResponseDrop::Repeated
             }),
             (Phase::Asking { .. }, ActionState::Idle)
             | (Phase::Closing { .. }, ActionState::Executing) => Err(ResponseDrop::State),

@@ -238,9 +238,10 @@ impl<P: Ord + Clone> Responder<P> {
         }
         // A Requestor without a response repeats its request, and each repetition gets a response.
         let is_repeated = entry_said || !matches!(outcome, Outcome::Refused(_));
-        let repeats = match is_repeated {
-            true => self.settings.done_repeats,
-            false => ONCE,
+        let repeats = if is_repeated {
+            self.settings.done_repeats
+        } else {
+            ONCE
         };
         self.conclude(id, (status, fields), repeats, now);
         told
@@ -543,9 +544,10 @@ impl<P: Ord + Clone> Responder<P> {
             Phase::Executing { abandoned, .. } => {
                 let first = !core::mem::replace(abandoned, true);
                 entry.answer(now, interval);
-                match first {
-                    true => Requested::Abandoned(execution),
-                    false => Requested::Repeated(execution),
+                if first {
+                    Requested::Abandoned(execution)
+                } else {
+                    Requested::Repeated(execution)
                 }
             }
             Phase::Done { .. } => {

@@ -296,12 +296,13 @@ impl<'a> Announced<'a> {
 
     fn read_action_meta_data(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         let action: ActionMetaData<'a> = Structure::read(reader, "ActionMetaData")?;
-        match action.has_its_methods() {
-            true => Ok(Self::ActionMetaData(action)),
-            false => Err(DecodeError::Reserved {
+        if action.has_its_methods() {
+            Ok(Self::ActionMetaData(action))
+        } else {
+            Err(DecodeError::Reserved {
                 field: "number of ActionMethods",
                 value: u32::try_from(action.action_methods.len()).unwrap_or(u32::MAX),
-            }),
+            })
         }
     }
 
@@ -315,9 +316,10 @@ impl<'a> Announced<'a> {
                 let is_cyclic = bool::read(reader, "IsCyclic")?;
                 Self::ApplicationStatus {
                     state: Structure::read(reader, "Status")?,
-                    cyclic: match is_cyclic {
-                        true => Some(Structure::read(reader, "CyclicStatus")?),
-                        false => None,
+                    cyclic: if is_cyclic {
+                        Some(Structure::read(reader, "CyclicStatus")?)
+                    } else {
+                        None
                     },
                 }
             }

@@ -211,9 +211,10 @@ impl Announcer {
             Probe::PublisherEndpoints => self.ask(Subject::PublisherEndpoints, now),
             Probe::DataSetMetaData(writer_ids) => {
                 for id in writer_ids {
-                    let subject = match self.actions.contains(&id) {
-                        true => Subject::ActionMetaData(id),
-                        false => Subject::DataSetMetaData(id),
+                    let subject = if self.actions.contains(&id) {
+                        Subject::ActionMetaData(id)
+                    } else {
+                        Subject::DataSetMetaData(id)
                     };
                     self.ask(subject, now);
                 }

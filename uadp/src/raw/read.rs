@@ -92,9 +92,10 @@ impl<'a> Iterator for RawFields<'a> {
     fn next(&mut self) -> Option<Self::Item> {
         let Some(field) = self.fields.next() else {
             let padding = core::mem::replace(&mut self.reader, Reader::new(&[])).rest();
-            return match padding.iter().all(|byte| *byte == 0) {
-                true => None,
-                false => Some(Err(DecodeError::TrailingBytes(padding.len()))),
+            return if padding.iter().all(|byte| *byte == 0) {
+                None
+            } else {
+                Some(Err(DecodeError::TrailingBytes(padding.len())))
             };
         };
         let value = read_field(field, self.form, &mut self.reader);
@@ -216,14 +217,13 @@ impl<'a> Walk<'a> {
             present = self.head & 1 != 0;
             self.head >>= 1;
         }
-        let value = match present {
-            true => Some(read_field(field, self.form, &mut self.reader)?),
-            false => {
-                if let Some(room) = field.absent_room(self.form) {
-                    check_zero(self.reader.bytes(room, PADDING)?)?;
-                }
-                None
+        let value = if present {
+            Some(read_field(field, self.form, &mut self.reader)?)
+        } else {
+            if let Some(room) = field.absent_room(self.form) {
+                check_zero(self.reader.bytes(room, PADDING)?)?;
             }
+            None
         };
         Ok(Some(Member {
             index,
@@ -468,9 +468,10 @@ fn read_elements<'a>(
             bytes,
         }));
     }
-    let array = match null {
-        true => Array::null(field.builtin),
-        false => Array::new(field.builtin, count, bytes)?,
+    let array = if null {
+        Array::null(field.builtin)
+    } else {
+        Array::new(field.builtin, count, bytes)?
     };
     Ok(match field.value_rank {
         1 => Variant::Array(array).into(),

@@ -393,9 +393,10 @@ fn write_dimensions(
     // Short rows have no defined position, so all inner dimensions must have their maximum size.
     let full_rows = items.len() != 0 && field.array_room(form).is_some();
     for (index, size) in dimensions.enumerate() {
-        let form = match full_rows && index != 0 {
-            true => Form::Open62541,
-            false => form,
+        let form = if full_rows && index != 0 {
+            Form::Open62541
+        } else {
+            form
         };
         let size = dimension(field, form, index, to_usize(size))?;
         buf.extend_from_slice(&size.to_le_bytes());

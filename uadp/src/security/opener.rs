@@ -194,9 +194,10 @@ impl Opener {
         let parts = Parts::of(message, &header)?;
         let token_id = header.token_id;
         let Some(entry) = self.ring.get_mut(token_id) else {
-            return Err(match self.ring.is_retired(token_id) {
-                true => SecurityError::RetiredToken(token_id),
-                false => SecurityError::UnknownToken(token_id),
+            return Err(if self.ring.is_retired(token_id) {
+                SecurityError::RetiredToken(token_id)
+            } else {
+                SecurityError::UnknownToken(token_id)
             });
         };
         if !entry.keys.verify(parts.signed, parts.signature) {
@@ -208,9 +209,10 @@ impl Opener {
             now,
             &self.options,
         )?;
-        let body = match header.encrypted {
-            true => decrypt(&entry.keys, nonce, parts.body, scratch)?,
-            false => parts.body,
+        let body = if header.encrypted {
+            decrypt(&entry.keys, nonce, parts.body, scratch)?
+        } else {
+            parts.body
         };
         let (payload, footer) = body
             .split_at_checked(parts.footer_at)

@@ -377,9 +377,10 @@ fn case() -> impl Strategy<Value = Case> {
             |((request, address, correlation), requestor, timeout, rest, messages)| {
                 let (group, timestamp, security, one_shot) = rest;
                 Case {
-                    kind: match request {
-                        true => ActionKind::Request,
-                        false => ActionKind::Response,
+                    kind: if request {
+                        ActionKind::Request
+                    } else {
+                        ActionKind::Response
                     },
                     address,
                     correlation,
@@ -405,9 +406,10 @@ impl Case {
     }
 
     fn messages(&self) -> &[Sent] {
-        match self.one_shot {
-            true => &self.messages[..1],
-            false => &self.messages,
+        if self.one_shot {
+            &self.messages[..1]
+        } else {
+            &self.messages
         }
     }
 
@@ -443,9 +445,10 @@ impl Case {
         let mut out = Vec::new();
         let mut encoder = ActionEncoder::new(&mut out, &start, &ids).unwrap();
         for sent in self.messages() {
-            let header = match self.one_shot {
-                true => DataSetHeader::default(),
-                false => sent.header,
+            let header = if self.one_shot {
+                DataSetHeader::default()
+            } else {
+                sent.header
             };
             if sent.raw {
                 encoder

@@ -182,9 +182,10 @@ impl World {
             && first.key().0 <= self.now
         {
             let (to_responder, datagram) = first.remove();
-            match to_responder {
-                true => self.request_arrives(&datagram),
-                false => self.response_arrives(&datagram),
+            if to_responder {
+                self.request_arrives(&datagram)
+            } else {
+                self.response_arrives(&datagram)
             }
         }
     }

@@ -406,9 +406,10 @@ fn action() -> impl Strategy<Value = ActionMetaData<'static>> {
                 action_targets: List::new(leak(targets)),
                 request,
                 response,
-                action_methods: match with_methods {
-                    true => List::new(leak(methods)),
-                    false => List::null(),
+                action_methods: if with_methods {
+                    List::new(leak(methods))
+                } else {
+                    List::null()
                 },
             }
         })

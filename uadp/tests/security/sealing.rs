@@ -43,14 +43,8 @@ proptest! {
         random in any::<[u8; 4]>(),
         before in 0..50_usize,
     ) {
-        let policy = match aes128 {
-            true => SecurityPolicy::PubSubAes128Ctr,
-            false => SecurityPolicy::PubSubAes256Ctr,
-        };
-        let mode = match encrypt {
-            true => SecurityMode::SignAndEncrypt,
-            false => SecurityMode::Sign,
-        };
+        let policy = if aes128 { SecurityPolicy::PubSubAes128Ctr } else { SecurityPolicy::PubSubAes256Ctr };
+        let mode = if encrypt { SecurityMode::SignAndEncrypt } else { SecurityMode::Sign };
         let keys = Keys::from_bytes(policy, &key_data[..policy.key_data_length()]).unwrap();
         let mut sealer = Sealer::new(mode);
         sealer.update_keys(3, [keys.clone()]).unwrap();

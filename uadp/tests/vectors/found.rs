@@ -14,9 +14,10 @@ pub(crate) fn describe_headers(message: &NetworkMessage<'_>) -> Result<Value, De
         let fields = fields.map(|field| field.map(describe_variant));
         fields.collect::<Result<Vec<_>, _>>()
     });
-    let chunk = match message.is_chunk() {
-        true => Some(message.chunk()?),
-        false => None,
+    let chunk = if message.is_chunk() {
+        Some(message.chunk()?)
+    } else {
+        None
     };
     Ok(json!({
         "publisherId": header.publisher_id.map(|id| match id {
