@@ -122,9 +122,10 @@ impl Application {
             sequence_number,
             announced: Announced::PublisherEndpoints {
                 endpoints: List::new(&endpoints),
-                status: match endpoints.is_empty() {
-                    true => BAD_NOT_SUPPORTED,
-                    false => StatusCode::GOOD,
+                status: if endpoints.is_empty() {
+                    BAD_NOT_SUPPORTED
+                } else {
+                    StatusCode::GOOD
                 },
             },
         };
@@ -140,9 +141,10 @@ impl Application {
                 locale: None,
                 text: Some(&self.name),
             },
-            application_type: match self.urls.is_empty() {
-                true => ApplicationType::CLIENT,
-                false => ApplicationType::SERVER,
+            application_type: if self.urls.is_empty() {
+                ApplicationType::CLIENT
+            } else {
+                ApplicationType::SERVER
             },
             discovery_urls: List::new(urls),
             ..ApplicationDescription::default()

@@ -514,9 +514,10 @@ impl CallDescription {
             })?);
             fields.push(Selected::whole(&leaf.path));
         }
-        let selection = match rest.is_empty() {
-            true => Selection::Whole,
-            false => Selection::Template { fields, rest },
+        let selection = if rest.is_empty() {
+            Selection::Whole
+        } else {
+            Selection::Template { fields, rest }
         };
         Ok((selection, order))
     }

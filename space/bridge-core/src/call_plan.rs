@@ -62,9 +62,10 @@ impl CallPlan {
     pub(crate) fn response(&self, fields: &[u8], out: &mut Vec<u8>) -> Result<(), (Cause, String)> {
         let count = Fields::parse(fields).map_err(fields::undecodable)?.len();
         let order = &self.response_order;
-        let arranged = match is_identity(order) && count == order.len() {
-            true => None,
-            false => Some(arrange(fields, order)?),
+        let arranged = if is_identity(order) && count == order.len() {
+            None
+        } else {
+            Some(arrange(fields, order)?)
         };
         let fields = Fields::parse(arranged.as_deref().unwrap_or(fields));
         fields::write(&self.response, fields.map_err(fields::undecodable)?, out)

@@ -476,9 +476,12 @@ pub(crate) fn mapped_leaves(variable: &Variable) -> Vec<Leaf> {
     if whole_message(variable).is_some() {
         return variable.fields.clone();
     }
-    let rank = |array| match array {
-        true => Rank::Array { fixed: None },
-        false => Rank::Scalar,
+    let rank = |array| {
+        if array {
+            Rank::Array { fixed: None }
+        } else {
+            Rank::Scalar
+        }
     };
     match variable.value_type {
         Some((builtin, array)) => vec![Leaf {

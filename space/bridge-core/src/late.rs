@@ -66,19 +66,20 @@ fn aged(time: Timestamp, now: Timestamp, within: Duration) -> Option<Late> {
     }
     let millis = age.abs() / 1_000_000;
     let within = within.as_millis();
-    Some(match age > 0 {
-        true => (
+    Some(if age > 0 {
+        (
             "old",
             format!(
                 "it was sent {millis} ms ago, but at most {within} ms are allowed; the broker is slow, or the clocks of the hosts differ"
             ),
-        ),
-        false => (
+        )
+    } else {
+        (
             "future",
             format!(
                 "it was sent {millis} ms in the future, so its age is unknown; synchronise the clocks of the hosts"
             ),
-        ),
+        )
     })
 }
 

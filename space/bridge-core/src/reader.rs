@@ -377,9 +377,10 @@ impl Reader {
                 SequenceOrder::Newer { missed } => {
                     next = true;
                     // Another sender counts on its own, or skips numbers.
-                    match moved {
-                        true => 0,
-                        false => u16::try_from(missed).unwrap_or(u16::MAX),
+                    if moved {
+                        0
+                    } else {
+                        u16::try_from(missed).unwrap_or(u16::MAX)
                     }
                 }
                 SequenceOrder::Same | SequenceOrder::Older { .. } | SequenceOrder::Invalid => 0,
@@ -549,9 +550,10 @@ impl Reader {
             self.known.clear();
             return None;
         };
-        let handed = match lasting {
-            true => Handed::Lasting,
-            false => Handed::Once,
+        let handed = if lasting {
+            Handed::Lasting
+        } else {
+            Handed::Once
         };
         self.note(stamp, (kept, handed), now)
     }

@@ -311,10 +311,7 @@ impl Redundancy {
                 .peers
                 .iter()
                 .any(|peer| peer.age(now.monotonic) < FORGOTTEN);
-        let patience = match alone {
-            true => QUIET,
-            false => PATIENCE + STALLED,
-        };
+        let patience = if alone { QUIET } else { PATIENCE + STALLED };
         Some(self.mute(MuteCause::Stalled, patience, now))
     }
 
@@ -499,9 +496,10 @@ impl Redundancy {
 
     /// Hands over if the ROS side is out of reach and a standby reaches it.
     fn look_at_sides(&mut self, now: Now) -> Option<RoleChange> {
-        self.unfit = match self.is_fit {
-            true => 0,
-            false => self.unfit.saturating_add(1),
+        self.unfit = if self.is_fit {
+            0
+        } else {
+            self.unfit.saturating_add(1)
         };
         let hands_over = self.unfit >= UNFIT && self.has_standby(true, now.monotonic);
         hands_over.then(|| self.release(MuteCause::Unfit, now))

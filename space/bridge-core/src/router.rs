@@ -244,9 +244,10 @@ impl Router {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let timer = self.values.due();
-        let pace = match self.values.paced.is_empty() && !self.is_chunking() {
-            true => None,
-            false => self.values.pace.opens(),
+        let pace = if self.values.paced.is_empty() && !self.is_chunking() {
+            None
+        } else {
+            self.values.pace.opens()
         };
         let chunks = self.reassembly.due();
         let announcements = self.announcements.due();

@@ -182,9 +182,10 @@ impl Cell {
         }
         for _ in 0..100_000 {
             self.turn += 1;
-            let next = match self.reorders && self.turn.is_multiple_of(2) {
-                true => self.under_way.pop_back(),
-                false => self.under_way.pop_front(),
+            let next = if self.reorders && self.turn.is_multiple_of(2) {
+                self.under_way.pop_back()
+            } else {
+                self.under_way.pop_front()
             };
             let Some((from, bytes)) = next else {
                 return;

@@ -78,9 +78,10 @@ fn redundant(port: u16, rank: u8, mapping: &Arc<Mapping>, cell: &mut Cell) -> Pr
 
 /// Creates the bridges, of which A is active, and the component. All know the calls of each other.
 fn plant(is_secured: bool) -> Cell {
-    let text = match is_secured {
-        true => format!("{PLAIN}{SECURED}"),
-        false => PLAIN.to_owned(),
+    let text = if is_secured {
+        format!("{PLAIN}{SECURED}")
+    } else {
+        PLAIN.to_owned()
     };
     let mapping = Mapping::from_yaml(&text, "cell.yaml").mapping.unwrap();
     let mapping = Arc::new(mapping);
@@ -129,9 +130,12 @@ fn is_response(bytes: &[u8]) -> bool {
 fn losing_responses(cell: &mut Cell) -> Rc<Shared<bool>> {
     let loses = Rc::new(Shared::new(true));
     let flag = Rc::clone(&loses);
-    cell.copies = Box::new(move |bytes| match flag.get() && is_response(bytes) {
-        true => 0,
-        false => 1,
+    cell.copies = Box::new(move |bytes| {
+        if flag.get() && is_response(bytes) {
+            0
+        } else {
+            1
+        }
     });
     loses
 }

@@ -384,10 +384,7 @@ proptest! {
             for (place, by, cut) in &changes {
                 let mut changed = datagram.clone();
                 let at = place.index(changed.len());
-                match cut {
-                    true => changed.truncate(at),
-                    false => changed[at] ^= by,
-                }
+                if *cut { changed.truncate(at) } else { changed[at] ^= by }
                 cell.hear(READER, &changed, from);
             }
         }

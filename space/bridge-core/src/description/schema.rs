@@ -16,9 +16,10 @@ pub(crate) fn with_structures<T>(
     then: impl FnOnce(DataTypeSchemaHeader<'_>) -> Result<T, EncodeError>,
 ) -> Result<T, EncodeError> {
     let structures = structures(message_type, leaves);
-    let namespaces = match structures.is_empty() {
-        true => Vec::new(),
-        false => namespaces_up_to(namespace, uris),
+    let namespaces = if structures.is_empty() {
+        Vec::new()
+    } else {
+        namespaces_up_to(namespace, uris)
     };
     let inner_sizes: Vec<Vec<Vec<u32>>> = structures.iter().map(member_sizes).collect();
     let inner: Vec<Vec<StructureField<'_>>> = structures

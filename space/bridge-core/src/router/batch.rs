@@ -21,9 +21,10 @@ impl Values {
         let topic = at.topic();
         // Each topic of a broker has its own messages. A message of several writers has the time of
         // its transmission.
-        let others = match self.relay.is_some() || self.keeps_time(at) {
-            false => self.gather(topic, &first, now.monotonic),
-            true => Vec::new(),
+        let others = if self.relay.is_some() || self.keeps_time(at) {
+            Vec::new()
+        } else {
+            self.gather(topic, &first, now.monotonic)
         };
         let with = others.iter().map(|(topic, _)| *topic).collect();
         if others.is_empty() {
@@ -84,9 +85,10 @@ impl Values {
                 && next.topic().triple().1 == topic.triple().1
                 && !(is_alone && is_in(next.topic(), topic, &gathered));
             let before = entry.counters.repeated;
-            let taken = match joins {
-                true => entry.take_within(left, &mut self.buffers),
-                false => None,
+            let taken = if joins {
+                entry.take_within(left, &mut self.buffers)
+            } else {
+                None
             };
             let taken = taken.map(|taken| {
                 let repeated = entry.counters.repeated != before;

@@ -477,9 +477,10 @@ impl CallTraffic<'_> {
         let since = calls.since_start(now);
         let known = calls.table.get(&topic).and_then(|call| call.known.as_ref());
         let impostor = known.is_some_and(|known| known.from != from) && !is_successor;
-        let heard = match impostor {
-            true => Err(ResponseDrop::Elsewhere),
-            false => calls.requestor.handle_response(response, since),
+        let heard = if impostor {
+            Err(ResponseDrop::Elsewhere)
+        } else {
+            calls.requestor.handle_response(response, since)
         };
         if heard.is_ok() {
             calls.spoke(topic);

@@ -81,9 +81,10 @@ impl Quality {
     pub(super) fn status(self, message: u16) -> u16 {
         let status = self.status.unwrap_or(StatusCode::GOOD);
         let value = u16::try_from(status.0 >> 16).unwrap_or(u16::MAX);
-        match value >> 14 > message >> 14 {
-            true => value,
-            false => message,
+        if value >> 14 > message >> 14 {
+            value
+        } else {
+            message
         }
     }
 }

@@ -130,9 +130,10 @@ impl Values {
             return Verdict::Drop(Reason::Looped);
         };
         // Only a sent message uses up a sequence number.
-        let sequence = match muted {
-            true => writer.expected_sequence(),
-            false => writer.next_sequence(),
+        let sequence = if muted {
+            writer.expected_sequence()
+        } else {
+            writer.next_sequence()
         };
         encoded.number(sequence);
         let message = if large {

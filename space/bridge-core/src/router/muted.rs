@@ -210,9 +210,10 @@ impl Values {
 
     /// Empties the queue of a topic if it is muted. Returns false if it is not muted.
     pub(super) fn mute_topic(&mut self, topic: TopicId, now: Now) -> bool {
-        let is_muted = match self.is_home(topic) {
-            true => self.is_muted(),
-            false => self.is_muted_locally(),
+        let is_muted = if self.is_home(topic) {
+            self.is_muted()
+        } else {
+            self.is_muted_locally()
         };
         if is_muted {
             self.empty_topic(topic, now);

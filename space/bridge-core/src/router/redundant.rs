@@ -130,9 +130,10 @@ impl Redundant {
 
     /// Records whether the network took the last heartbeat.
     pub(super) fn heartbeat_sent(&mut self, is_sent: bool, now: Now) -> Option<RoleChange> {
-        match is_sent {
-            true => self.state.sent(now),
-            false => self.state.not_sent(now),
+        if is_sent {
+            self.state.sent(now)
+        } else {
+            self.state.not_sent(now)
         }
     }
 

@@ -238,9 +238,10 @@ impl Values {
                 }
             }
         }
-        let reason = match keeps_latest && self.is_withheld(topic) {
-            true => Reason::Outpaced,
-            false => Reason::Overflow,
+        let reason = if keeps_latest && self.is_withheld(topic) {
+            Reason::Outpaced
+        } else {
+            Reason::Overflow
         };
         self.count(About::topic(topic), reason, count, || {
             "the queue was full, its oldest sample was dropped".to_owned()

@@ -75,9 +75,10 @@ impl Applications {
         bytes: &mut Vec<u8>,
     ) -> Option<Result<(), EncodeError>> {
         let own = self.own.as_ref()?;
-        Some(match endpoints {
-            false => own.announce(head, bytes),
-            true => own.announce_endpoints(head, bytes),
+        Some(if endpoints {
+            own.announce_endpoints(head, bytes)
+        } else {
+            own.announce(head, bytes)
         })
     }
 

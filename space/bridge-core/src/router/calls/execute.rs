@@ -181,9 +181,10 @@ impl CallTraffic<'_> {
         };
         let since = calls.since_start(now);
         let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
-        let judged = match is_redundant && request.target_id == LASTING_TARGET {
-            true => Err(without_target(from)),
-            false => may_be_executed(own, request, (from, group), known),
+        let judged = if is_redundant && request.target_id == LASTING_TARGET {
+            Err(without_target(from))
+        } else {
+            may_be_executed(own, request, (from, group), known)
         };
         let verdict = judged.as_ref().map(|_| ()).map_err(|refused| refused.0);
         let requested = calls
@@ -197,13 +198,14 @@ impl CallTraffic<'_> {
                 // The requestor receives the outcome when it repeats the request.
                 let _told = calls.responder.finish(id, lost, since).is_ok();
                 let cause = (Reason::CallRefused, "earlier life");
-                self.count_call(topic, Some(from), cause, || match is_redundant {
-                    true => {
+                self.count_call(topic, Some(from), cause, || {
+                    if is_redundant {
                         "not executed: the request was sent to the bridge that was active before"
                             .to_owned()
+                    } else {
+                        "not executed: the request was sent before this program was restarted"
+                            .to_owned()
                     }
-                    false => "not executed: the request was sent before this program was restarted"
-                        .to_owned(),
                 });
             }
             Ok(Requested::Execute(id)) => {
