@@ -220,9 +220,10 @@ impl Actions {
             }
             events.push(event);
         }
-        match events.is_empty() {
-            true => Poll::Pending,
-            false => Poll::Ready(events),
+        if events.is_empty() {
+            Poll::Pending
+        } else {
+            Poll::Ready(events)
         }
     }
 }

@@ -45,10 +45,7 @@ impl BusyPoll {
         let soon = self
             .last
             .is_some_and(|last| at.saturating_duration_since(last) <= SHORT);
-        self.credit = match soon {
-            true => (self.credit + 1).min(MOST),
-            false => 0,
-        };
+        self.credit = if soon { (self.credit + 1).min(MOST) } else { 0 };
         self.last = Some(at);
         self.idle = None;
     }

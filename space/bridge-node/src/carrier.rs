@@ -42,9 +42,10 @@ pub(crate) fn open(
     let listed = &mapping.pubsub().carriers;
     if url.is_none() && !listed.is_empty() {
         let (carriers, options) = open_all(listed, &identity, arguments, (several, hub))?;
-        let rules: Box<dyn CarrierRules> = match arguments.flags.dry_run {
-            true => Box::new(NoRoutes),
-            false => Box::new(LiveRoutes::new(mapping, Some(changes.clone()))),
+        let rules: Box<dyn CarrierRules> = if arguments.flags.dry_run {
+            Box::new(NoRoutes)
+        } else {
+            Box::new(LiveRoutes::new(mapping, Some(changes.clone())))
         };
         return Ok((Box::new(Carriers::new(carriers, rules)), options));
     }

@@ -307,17 +307,19 @@ async fn keep(
             failure.kind(),
             FailureKind::Usage | FailureKind::Configuration
         );
-        let next = match is_refused {
-            true => "it is started again when the mapping changes".to_owned(),
-            false => format!("it is started again in {pause:?}"),
+        let next = if is_refused {
+            "it is started again when the mapping changes".to_owned()
+        } else {
+            format!("it is started again in {pause:?}")
         };
         log_failure(name, &failure, (&next, is_refused));
         host.failed(name, &failure, &next);
         let mut hangup = signals::listen(SignalKind::hangup())?;
         let again = async {
-            match is_refused {
-                true => changed(mapping.as_deref(), before).await,
-                false => sleep(pause).await,
+            if is_refused {
+                changed(mapping.as_deref(), before).await
+            } else {
+                sleep(pause).await
             }
         };
         tokio::select! {

@@ -269,13 +269,14 @@ async fn run<C: ServiceCall + Sync>(
 ) {
     // Compared here for all clients, and again by the client when it sends the request: it may have
     // to look the service up and to connect before.
-    let result = match now().monotonic <= start_by {
-        true => client.call_by(request, Some(start_by)).await,
-        false => Err(CallFault {
+    let result = if now().monotonic <= start_by {
+        client.call_by(request, Some(start_by)).await
+    } else {
+        Err(CallFault {
             text: TOO_LATE.to_owned(),
             may_pass: true,
             ran: Ran::No,
-        }),
+        })
     };
     drop(place);
     drop(report.send(Done { execution, result }));

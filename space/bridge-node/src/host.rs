@@ -153,9 +153,10 @@ impl ProcessHost {
     pub(crate) fn failed(&self, program: &'static str, failure: &Failure, again: &str) {
         self.pages.down(program, format!("{failure}; {again}"));
         let refused = [FailureKind::Usage, FailureKind::Configuration];
-        let state = match refused.contains(&failure.kind()) {
-            true => ProgramState::Refused(failure.clone()),
-            false => ProgramState::Failed,
+        let state = if refused.contains(&failure.kind()) {
+            ProgramState::Refused(failure.clone())
+        } else {
+            ProgramState::Failed
         };
         self.set(program, state);
     }

@@ -149,9 +149,10 @@ impl<S: Send, E: ServiceCall + Sync> RosRequests<S, E> {
     /// Executes a call of the local side for another space. A refusal is added to `events`.
     pub fn execute(&mut self, execution: Execution, events: &mut VecDeque<PortEvent>) {
         let id = execution.id;
-        let begun = match self.actions.serves(execution.topic) {
-            true => self.actions.execute(execution),
-            false => self.executing.execute(execution),
+        let begun = if self.actions.serves(execution.topic) {
+            self.actions.execute(execution)
+        } else {
+            self.executing.execute(execution)
         };
         if let Err(refusal) = begun {
             events.push_back(PortEvent::Executed {

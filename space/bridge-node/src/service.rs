@@ -76,9 +76,10 @@ pub(crate) fn parse<P: Parser>(
         // Printing fails if stdout or stderr is closed.
         let _printed = usage.print();
         let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
-        match asked.contains(&usage.kind()) {
-            true => ExitCode::SUCCESS,
-            false => FailureKind::Usage.into(),
+        if asked.contains(&usage.kind()) {
+            ExitCode::SUCCESS
+        } else {
+            FailureKind::Usage.into()
         }
     })
 }

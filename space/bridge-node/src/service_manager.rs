@@ -28,9 +28,10 @@ pub fn ready() {
 /// Reports the end of the program, or a restart in the same process, which ends with another
 /// [`ready`].
 pub(crate) fn ending() {
-    match restart::is_requested() {
-        true => send("RELOADING=1"),
-        false => send("STOPPING=1"),
+    if restart::is_requested() {
+        send("RELOADING=1")
+    } else {
+        send("STOPPING=1")
     }
 }
 
@@ -154,9 +155,10 @@ impl ServiceManager {
 
     fn send(&self, state: &str) -> io::Result<()> {
         let sent = self.socket.send_to_addr(state.as_bytes(), &self.address)?;
-        match sent == state.len() {
-            true => Ok(()),
-            false => Err(io::ErrorKind::WriteZero.into()),
+        if sent == state.len() {
+            Ok(())
+        } else {
+            Err(io::ErrorKind::WriteZero.into())
         }
     }
 }

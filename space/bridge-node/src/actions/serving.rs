@@ -370,10 +370,7 @@ impl<C: ActionClient> Serving<C> {
                 }
                 None => Ok(()),
             },
-            GoalEvent::Status(status) => match self.goals.status(id, status) {
-                true => self.tell_statuses().await,
-                false => Ok(()),
-            },
+            GoalEvent::Status(status) => if self.goals.status(id, status) { self.tell_statuses().await } else { Ok(()) },
             GoalEvent::Feedback(body) => match self.action.encoding.join(id, &body) {
                 Some(value) => self.sample(self.action.feedback, value).await,
                 None => Ok(()),
@@ -478,9 +475,10 @@ impl<C: ActionClient> Serving<C> {
         // The callers repeat their requests.
         let not_yet = Executed::Refused(Refusal::NotExecutable);
         self.finish_all(late, &not_yet).await?;
-        match forgotten {
-            true => self.tell_statuses().await,
-            false => Ok(()),
+        if forgotten {
+            self.tell_statuses().await
+        } else {
+            Ok(())
         }
     }
 

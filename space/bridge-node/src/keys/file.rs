@@ -64,9 +64,10 @@ pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Fa
 }
 
 fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
-    let written = match text.trim_start().starts_with('[') {
-        true => serde_json::from_str(text),
-        false => serde_json::from_str(text).map(|one| vec![one]),
+    let written = if text.trim_start().starts_with('[') {
+        serde_json::from_str(text)
+    } else {
+        serde_json::from_str(text).map(|one| vec![one])
     };
     let written: Vec<Written> = written.map_err(|error| {
         // The content of the file is not shown.

@@ -71,14 +71,13 @@ fn add_spaces(
             }
             None => format!("nothing received on {interface}"),
         };
-        let reason = || match *space == SpaceId::UA {
-            true => {
+        let reason = || {
+            if *space == SpaceId::UA {
                 format!(
                     "{reason}: check that ua-server or the component runs and uses this network and \
                      group"
                 )
-            }
-            false => {
+            } else {
                 format!(
                     "{reason}: check that the bridge of the space runs and uses this network and \
                      group"
@@ -89,12 +88,13 @@ fn add_spaces(
     }
     for call in mapping.calls() {
         let space = call.topic.space;
-        let is_asked = match own == SpaceId::UA {
-            true => !matches!(
+        let is_asked = if own == SpaceId::UA {
+            !matches!(
                 call.executed,
                 ExecutedBy::OpcUa(_) | ExecutedBy::Acknowledging
-            ),
-            false => call.asked.iter().any(|binding| binding.space == own),
+            )
+        } else {
+            call.asked.iter().any(|binding| binding.space == own)
         };
         let is_online = matches!(received.get(&space), Some(Presence::Online));
         if space != own && is_asked && is_online && router.described_call(call.topic).is_none() {
@@ -217,12 +217,13 @@ calls:
         for own in [SpaceId::ROS1, SpaceId::UA] {
             let mut router = router(own);
             let now = now();
-            let expected = match own == SpaceId::UA {
-                true => vec![
+            let expected = if own == SpaceId::UA {
+                vec![
                     "space 1: nothing received on eth0",
                     "space 2: nothing received on eth0",
-                ],
-                false => vec!["space 2: nothing received on eth0"],
+                ]
+            } else {
+                vec!["space 2: nothing received on eth0"]
             };
             assert_eq!(missing(&router, own, now.monotonic), expected);
             let from = SocketAddr::from(([127, 0, 0, 1], 50_001));

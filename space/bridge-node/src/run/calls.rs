@@ -128,9 +128,10 @@ impl<P: Port> Shell<P> {
             })
             .collect();
         for (topic, description) in known {
-            match offers {
-                true => self.port.call_known(topic, &description),
-                false => self.port.call_gone(topic),
+            if offers {
+                self.port.call_known(topic, &description)
+            } else {
+                self.port.call_gone(topic)
             }
         }
     }
