@@ -408,9 +408,10 @@ impl Outlet {
         self.last = None;
         let mut rest = None;
         if sample.lasting {
-            rest = match limits::PATCHED {
-                true => self.write(sample, now)?,
-                false => Some(sample),
+            rest = if limits::PATCHED {
+                self.write(sample, now)?
+            } else {
+                Some(sample)
             };
         }
         if let Audience::Nobody { held } = &mut self.audience {

@@ -73,13 +73,15 @@ impl Requested {
 
 impl fmt::Display for Requested {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self.reliable {
-            true => "reliable",
-            false => "best effort",
+        f.write_str(if self.reliable {
+            "reliable"
+        } else {
+            "best effort"
         })?;
-        f.write_str(match self.transient_local {
-            true => ", transient local",
-            false => ", volatile",
+        f.write_str(if self.transient_local {
+            ", transient local"
+        } else {
+            ", volatile"
         })
     }
 }

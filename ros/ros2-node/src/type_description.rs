@@ -182,10 +182,7 @@ fn answer(known: &Known, request: &TypeRequest) -> Bytes {
     };
     write_type(&mut writer, described.first().unwrap_or(&nothing));
     writer.sequence(described.get(1..).unwrap_or_default(), write_type);
-    let sources = match request.sources {
-        true => sources,
-        false => &[],
-    };
+    let sources = if request.sources { sources } else { &[] };
     writer.sequence(sources, |writer, source| {
         writer.string(&source.name);
         writer.string(source.encoding);

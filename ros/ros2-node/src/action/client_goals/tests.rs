@@ -189,9 +189,10 @@ fn a_goal_that_is_withdrawn_is_to_be_cancelled_once_it_is_accepted() {
         assert!(goals.is_withdrawn(id(1)) && !goals.is_withdrawn(id(2)));
         assert_eq!(goals.cancel_due(id(1)), None);
         let late = start + Duration::from_secs(3);
-        match by_status {
-            true => goals.status(id(1), (Status::Accepted, STAMP), late),
-            false => goals.accepted(id(1), STAMP, late),
+        if by_status {
+            goals.status(id(1), (Status::Accepted, STAMP), late)
+        } else {
+            goals.accepted(id(1), STAMP, late)
         }
         assert_eq!(goals.cancel_due(id(1)), Some(late));
         assert!(goals.is_accepted(id(1)) && goals.undecided() == [id(2)]);
