@@ -68,9 +68,10 @@ fn check(case: &Path) -> Result<(), String> {
             let mut made: Dataset = output.quads.into_iter().collect();
             wanted.canonicalize(CanonicalizationAlgorithm::Unstable);
             made.canonicalize(CanonicalizationAlgorithm::Unstable);
-            match wanted == made {
-                true => Ok(()),
-                false => Err(format!("expected:\n{wanted}made:\n{made}")),
+            if wanted == made {
+                Ok(())
+            } else {
+                Err(format!("expected:\n{wanted}made:\n{made}"))
             }
         }
     }
