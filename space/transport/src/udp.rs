@@ -343,9 +343,10 @@ impl Udp {
         let filled = self.receiver.try_io(Interest::READABLE, || {
             // `WouldBlock` clears the readiness: no datagram waits behind a batch that is not
             // full, and a call that finds nothing is saved.
-            match batch.fill(socket)? {
-                true => Ok(()),
-                false => Err(io::ErrorKind::WouldBlock.into()),
+            if batch.fill(socket)? {
+                Ok(())
+            } else {
+                Err(io::ErrorKind::WouldBlock.into())
             }
         });
         match filled {

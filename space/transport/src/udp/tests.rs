@@ -202,9 +202,10 @@ fn own_datagrams_are_dropped_by_the_kernel_and_received_on_request() {
                     .send_to(b"end", address.parse::<SocketAddr>().unwrap())
                     .unwrap();
                 let datagrams = received(&mut member, source).await;
-                let expected: &[Vec<u8>] = match own {
-                    true => &[b"1".to_vec(), b"2".to_vec()],
-                    false => &[],
+                let expected: &[Vec<u8>] = if own {
+                    &[b"1".to_vec(), b"2".to_vec()]
+                } else {
+                    &[]
                 };
                 assert_eq!(datagrams, expected, "{options:?}");
             }
