@@ -37,9 +37,10 @@ impl Genuine {
             all.insert(context.session_id, genuine);
             genuine
         });
-        match genuine {
-            true => Ok(()),
-            false => Err(StatusCode::BadCertificateUriInvalid),
+        if genuine {
+            Ok(())
+        } else {
+            Err(StatusCode::BadCertificateUriInvalid)
         }
     }
 }

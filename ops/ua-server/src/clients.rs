@@ -21,9 +21,10 @@ impl Clients {
                 pki: Some(pki.to_owned()),
                 timeout: ANSWERS_WITHIN,
                 keep_alive: KEEP_ALIVE,
-                host_names: match server.refuse_other_hosts {
-                    true => HostNames::Refuse,
-                    false => HostNames::Warn,
+                host_names: if server.refuse_other_hosts {
+                    HostNames::Refuse
+                } else {
+                    HostNames::Warn
                 },
                 ..ClientConfig::new(&server.application_uri, "UA bridge server")
             },

@@ -85,14 +85,12 @@ impl Components {
         let name = &known.name;
         log(found);
         let online = !matches!(found, Found::Gone { .. });
-        match online {
-            true => self.gone.retain(|gone| gone != name),
-            false => self.gone.push_back(name.clone()),
+        if online {
+            self.gone.retain(|gone| gone != name)
+        } else {
+            self.gone.push_back(name.clone())
         }
-        let since = match online {
-            true => known.since,
-            false => wall(),
-        };
+        let since = if online { known.since } else { wall() };
         let topic = self.presence.show(known, (online, since));
         let oldest = (self.gone.len() > MOST_GONE)
             .then(|| self.gone.pop_front())

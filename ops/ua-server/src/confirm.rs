@@ -230,9 +230,10 @@ fn are_equal(one: &Variant, other: &Variant) -> bool {
         return false;
     };
     let is_float = |value: &Variant| matches!(value, Variant::Float(_));
-    let least = match is_float(one) || is_float(other) {
-        true => f64::from(f32::EPSILON) * first.abs().max(second.abs()),
-        false => 0.0,
+    let least = if is_float(one) || is_float(other) {
+        f64::from(f32::EPSILON) * first.abs().max(second.abs())
+    } else {
+        0.0
     };
     (first - second).abs() <= least
 }

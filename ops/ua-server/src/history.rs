@@ -408,9 +408,10 @@ fn made(value: Option<Variant>, (quality, how): (Quality, u32), time: i64) -> Da
 
 /// Marks the value of an interval that is shorter than the others. A bad status stays unchanged.
 fn partial(status: StatusCode) -> StatusCode {
-    match status.is_bad() {
-        true => status,
-        false => StatusCode::from(status.bits() | PARTIAL),
+    if status.is_bad() {
+        status
+    } else {
+        StatusCode::from(status.bits() | PARTIAL)
     }
 }
 

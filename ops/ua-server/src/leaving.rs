@@ -93,9 +93,10 @@ pub(crate) struct Leaving {
 
 impl Default for Leaving {
     fn default() -> Self {
-        let window = match *SEVERAL_CORES {
-            true => POLLING,
-            false => Duration::ZERO,
+        let window = if *SEVERAL_CORES {
+            POLLING
+        } else {
+            Duration::ZERO
         };
         Self {
             values: Vec::new(),
@@ -135,9 +136,10 @@ impl Leaving {
     /// Answers all handled writes: their values equal the previous ones, wait for their turn, or
     /// are not sent because another server is active.
     pub(crate) fn drained(&mut self, is_muted: bool) {
-        let status = match is_muted {
-            true => NOT_ACTIVE,
-            false => StatusCode::Good,
+        let status = if is_muted {
+            NOT_ACTIVE
+        } else {
+            StatusCode::Good
         };
         for (_, departure) in self.values.drain(..) {
             departure.answer(status);

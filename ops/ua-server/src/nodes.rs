@@ -336,9 +336,12 @@ impl SpaceNodes {
             return StatusCode::BadUserAccessDenied;
         }
         let called = self.pubsub.call(method, &Caller::of(context).user);
-        called.unwrap_or_else(|| match self.nodesets.has(method) {
-            true => StatusCode::BadNotExecutable,
-            false => StatusCode::BadNodeIdUnknown,
+        called.unwrap_or_else(|| {
+            if self.nodesets.has(method) {
+                StatusCode::BadNotExecutable
+            } else {
+                StatusCode::BadNodeIdUnknown
+            }
         })
     }
 

@@ -371,9 +371,10 @@ impl Port for ServerPort {
     }
 
     fn execute(&mut self, execution: Execution) -> bool {
-        match self.others.skills.serves(execution.topic) {
-            true => self.others.skills.execute(execution),
-            false => self.others.executing.execute(&execution),
+        if self.others.skills.serves(execution.topic) {
+            self.others.skills.execute(execution)
+        } else {
+            self.others.executing.execute(&execution)
         }
     }
 

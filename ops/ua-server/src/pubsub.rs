@@ -205,9 +205,10 @@ impl PubSub {
             }
             let switched = std::mem::take(&mut inner.switched);
             let is_unseen = self.has_no_readers.load(Ordering::Relaxed);
-            let wanted = match is_unseen {
-                true => Wanted::WithoutReaders,
-                false => Wanted::All,
+            let wanted = if is_unseen {
+                Wanted::WithoutReaders
+            } else {
+                Wanted::All
             };
             *inner = insert::all(mapping, layout, &mut address_space, wanted);
             inner.unseen = is_unseen.then(|| (Arc::clone(mapping), Arc::clone(layout)));

@@ -216,9 +216,10 @@ impl Condition {
         if self.topics > 0 && self.silent >= self.topics {
             return NO_DATA;
         }
-        let best = match self.is_standby {
-            true => BEST_DEGRADED,
-            false => u8::MAX,
+        let best = if self.is_standby {
+            BEST_DEGRADED
+        } else {
+            u8::MAX
         };
         let lost = self.silent.saturating_mul(RANGE) / self.topics.max(1);
         best.saturating_sub(u8::try_from(lost).unwrap_or(u8::MAX))

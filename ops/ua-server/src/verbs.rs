@@ -361,9 +361,10 @@ fn password(name: &str) -> Result<String, VerbFault> {
     let read = stdin.lock().read_line(&mut line);
     read.map_err(VerbFault::Password)?;
     let password = line.trim_end_matches(['\n', '\r']);
-    match password.is_empty() {
-        true => Err(VerbFault::NoPassword),
-        false => Ok(password.to_owned()),
+    if password.is_empty() {
+        Err(VerbFault::NoPassword)
+    } else {
+        Ok(password.to_owned())
     }
 }
 

@@ -225,9 +225,10 @@ impl ConditionEvent {
             return identity.limit(level).map(Variant::from);
         }
         match (identity.kind, name, below) {
-            (Kind::ExclusiveLevel, "LimitState", ["CurrentState"]) => Some(match state.active.on {
-                true => english(state.levels.name()),
-                false => Variant::from(LocalizedText::null()),
+            (Kind::ExclusiveLevel, "LimitState", ["CurrentState"]) => Some(if state.active.on {
+                english(state.levels.name())
+            } else {
+                Variant::from(LocalizedText::null())
             }),
             (Kind::ExclusiveLevel, "LimitState", ["CurrentState", "Id"]) => {
                 Some(limit_state(state.levels).into())

@@ -59,9 +59,10 @@ impl PastEvents {
             let rest = ContinuationPoint::new(Box::new(Rest(rest)));
             node.set_next_continuation_point(Some(rest));
         }
-        node.set_status(match found.is_empty() {
-            true => StatusCode::GoodNoData,
-            false => StatusCode::Good,
+        node.set_status(if found.is_empty() {
+            StatusCode::GoodNoData
+        } else {
+            StatusCode::Good
         });
         let events = found.into_iter().map(|fields| HistoryEventFieldList {
             event_fields: fields.event_fields,

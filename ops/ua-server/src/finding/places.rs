@@ -101,9 +101,10 @@ impl Places {
             .take(MOST_NAME)
             .collect();
         let is_taken = named.contains(&name) || self.given.values().any(|place| place.name == name);
-        match is_taken {
-            true => format!("{name}-{namespace}"),
-            false => name,
+        if is_taken {
+            format!("{name}-{namespace}")
+        } else {
+            name
         }
     }
 }

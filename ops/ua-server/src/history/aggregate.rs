@@ -110,9 +110,12 @@ pub(super) fn of(
     };
     // The earlier bound is excluded in backward intervals, the later bound in forward intervals.
     let place = |bound: i64| {
-        samples.partition_point(|sample| match start <= end {
-            true => sample.time < bound,
-            false => sample.time <= bound,
+        samples.partition_point(|sample| {
+            if start <= end {
+                sample.time < bound
+            } else {
+                sample.time <= bound
+            }
         })
     };
     let (first, last) = (place(from), place(to));
@@ -200,9 +203,10 @@ fn of_values(
         Aggregate::Delta => {
             // Samples before the first and after the last number are bad.
             let ends = [within.first(), within.last()].map(|end| end.map(|(at, _)| *at));
-            let quality = match ends == [Some(first.0), Some(last.0)] {
-                true => Quality::Good,
-                false => Quality::Uncertain,
+            let quality = if ends == [Some(first.0), Some(last.0)] {
+                Quality::Good
+            } else {
+                Quality::Uncertain
             };
             Outcome::Calculated(last.1 - first.1, quality)
         }
@@ -362,9 +366,10 @@ pub(super) fn at(samples: &[Sample], time: i64, rules: Rules) -> Outcome {
         }) => {
             let whole = (next - low.time).max(1);
             let part = (time - low.time) as f64 / whole as f64;
-            let quality = match skipped || doubtful {
-                true => Quality::Uncertain,
-                false => Quality::Good,
+            let quality = if skipped || doubtful {
+                Quality::Uncertain
+            } else {
+                Quality::Good
             };
             Outcome::Interpolated(from + (to - from) * part, quality)
         }
@@ -398,9 +403,10 @@ impl Rules {
     fn quality(self, all: impl Iterator<Item = Quality>) -> Option<Quality> {
         let (mut good, mut bad) = (0_u64, 0_u64);
         for quality in all {
-            match self.takes(quality) {
-                true => good += 1,
-                false => bad += 1,
+            if self.takes(quality) {
+                good += 1
+            } else {
+                bad += 1
             }
         }
         let all = good + bad;

@@ -308,9 +308,10 @@ impl WritePath {
 
 /// Returns the new status of a written value, or `None` if its status stays.
 fn arrived(shown: StatusCode, has_arrived: bool) -> Option<StatusCode> {
-    let (before, after) = match has_arrived {
-        true => (UNCONFIRMED, StatusCode::Good),
-        false => (StatusCode::Good, UNCONFIRMED),
+    let (before, after) = if has_arrived {
+        (UNCONFIRMED, StatusCode::Good)
+    } else {
+        (StatusCode::Good, UNCONFIRMED)
     };
     (shown == before).then_some(after)
 }

@@ -239,9 +239,10 @@ impl Diagnostics {
         for shown in &mut self.counters {
             let counted = shown.counter.of(&self.states, counts);
             let now = u32::try_from(counted.saturating_sub(shown.base)).unwrap_or(u32::MAX);
-            let total = match shown.counter.is_error() {
-                true => &mut totals.1,
-                false => &mut totals.0,
+            let total = if shown.counter.is_error() {
+                &mut totals.1
+            } else {
+                &mut totals.0
             };
             *total = total.saturating_add(now);
             if now != shown.shown {

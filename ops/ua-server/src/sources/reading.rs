@@ -254,9 +254,10 @@ impl Reader {
         for read in &there {
             self.faulty.remove(&read.topic);
         }
-        match there.is_empty() {
-            true => Ok(()),
-            false => self.subscribe(there).await,
+        if there.is_empty() {
+            Ok(())
+        } else {
+            self.subscribe(there).await
         }
     }
 
