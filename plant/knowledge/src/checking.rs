@@ -86,9 +86,10 @@ fn compiled(knowledge: &Knowledge) -> Result<Compiled, KnowledgeFault> {
 
 /// Writes a report, which takes long for many violations.
 fn page(report: &Report, shapes: &Shapes, is_json: bool) -> io::Result<Response<Full<Bytes>>> {
-    match is_json {
-        true => Ok(json_page(&report.json())),
-        false => Ok(content("text/turtle", report.turtle(shapes)?)),
+    if is_json {
+        Ok(json_page(&report.json()))
+    } else {
+        Ok(content("text/turtle", report.turtle(shapes)?))
     }
 }
 

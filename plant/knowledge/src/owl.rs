@@ -257,9 +257,10 @@ impl Reading {
                 );
                 continue;
             };
-            let (from, to) = match is_forward {
-                true => (subject.clone(), target),
-                false => (target, subject.clone()),
+            let (from, to) = if is_forward {
+                (subject.clone(), target)
+            } else {
+                (target, subject.clone())
             };
             let predicate = match (predicate.as_str(), kind) {
                 (HAS_SUBTYPE, _) => {

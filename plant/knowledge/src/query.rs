@@ -363,9 +363,10 @@ impl Work {
             (QueryResults::Solutions(solutions), Asked::Question(question, _)) => {
                 let answer = question.answer(solutions);
                 let answer = answer.map_err(|error| self.fault(&error))?;
-                match answer.rows.len() < MOST_ROWS {
-                    true => Ok(Results::Answer(answer)),
-                    false => Err(self.too_much()),
+                if answer.rows.len() < MOST_ROWS {
+                    Ok(Results::Answer(answer))
+                } else {
+                    Err(self.too_much())
                 }
             }
             (QueryResults::Solutions(solutions), Asked::Sparql(.., formats)) => self.solutions(

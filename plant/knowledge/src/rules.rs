@@ -240,9 +240,10 @@ impl Properties {
         let of_others = self.sources.get(property).cloned().unwrap_or_default();
         let itself = (property.clone(), Direction::Same);
         for (source, direction) in of_others.into_iter().chain([itself]) {
-            let ends = match end == direction {
-                true => &mut self.subjects,
-                false => &mut self.objects,
+            let ends = if end == direction {
+                &mut self.subjects
+            } else {
+                &mut self.objects
             };
             let known = ends.entry(source).or_default();
             known.extend(classes.iter().cloned());
@@ -322,9 +323,10 @@ fn all_images(images: &Images) -> Images {
         let mut waiting = vec![itself.clone()];
         while let Some((next, so_far)) = waiting.pop() {
             for (image, direction) in images.get(&next).into_iter().flatten() {
-                let direction = match so_far == *direction {
-                    true => Direction::Same,
-                    false => Direction::Reversed,
+                let direction = if so_far == *direction {
+                    Direction::Same
+                } else {
+                    Direction::Reversed
                 };
                 let image = (image.clone(), direction);
                 if image != itself && seen.insert(image.clone()) {

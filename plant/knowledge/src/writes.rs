@@ -162,9 +162,10 @@ impl Site {
             }
             (Method::DELETE, number) => {
                 require(&writes.may_run, &request, why).await?;
-                match number.parse().is_ok_and(|number| writes.jobs.stop(number)) {
-                    true => Ok(status(StatusCode::NO_CONTENT)),
-                    false => Err(Refusal::unknown("there is no such job".to_owned())),
+                if number.parse().is_ok_and(|number| writes.jobs.stop(number)) {
+                    Ok(status(StatusCode::NO_CONTENT))
+                } else {
+                    Err(Refusal::unknown("there is no such job".to_owned()))
                 }
             }
             _ => Err(Refusal::method(
@@ -395,9 +396,10 @@ async fn require(may: &May, request: &Request<Incoming>, why: &str) -> Result<()
         let (name, password) = text.split_once(':')?;
         Some((name.to_owned(), password.to_owned()))
     });
-    match may(user).await {
-        true => Ok(()),
-        false => Err(Refusal::new(StatusCode::UNAUTHORIZED, "user", why)),
+    if may(user).await {
+        Ok(())
+    } else {
+        Err(Refusal::new(StatusCode::UNAUTHORIZED, "user", why))
     }
 }
 

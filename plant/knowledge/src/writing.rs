@@ -190,9 +190,10 @@ impl<'a> Writing<'a> {
             statuses.push((source.clone(), status));
         }
         let rules = &self.written.rules;
-        let derived = match self.is_of_schema {
-            true => rules.after_schema(&self.transaction, &self.touched)?,
-            false => rules.after(&self.transaction, &self.touched)?,
+        let derived = if self.is_of_schema {
+            rules.after_schema(&self.transaction, &self.touched)?
+        } else {
+            rules.after(&self.transaction, &self.touched)?
         };
         derive(&mut self.transaction, &derived)?;
         let written = &mut *self.written;

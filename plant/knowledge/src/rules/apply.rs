@@ -280,9 +280,10 @@ impl<'a> Changing<'a> {
     /// Notes a statement that may follow.
     fn follows(&mut self, triple: Triple, is_known: bool) -> Result<(), Stop> {
         *self.candidates.entry(triple).or_default() |= is_known;
-        match self.candidates.len() > self.most {
-            true => Err(Stop::TooMany),
-            false => Ok(()),
+        if self.candidates.len() > self.most {
+            Err(Stop::TooMany)
+        } else {
+            Ok(())
         }
     }
 
@@ -387,9 +388,10 @@ impl<'a> Changing<'a> {
 
     fn visit(&mut self, nodes: usize) -> Result<(), Stop> {
         self.visits = self.visits.saturating_sub(1);
-        match self.visits == 0 || nodes > self.most {
-            true => Err(Stop::TooMany),
-            false => Ok(()),
+        if self.visits == 0 || nodes > self.most {
+            Err(Stop::TooMany)
+        } else {
+            Ok(())
         }
     }
 

@@ -308,9 +308,10 @@ impl Shapes {
             }
             "datatype" => {
                 let datatype = named(value)?;
-                let is_valid = match CHECKED.iter().any(|known| datatype == *known) {
-                    true => format!("COALESCE({datatype}(STR(?value)) = ?value, false)"),
-                    false => "true".to_owned(),
+                let is_valid = if CHECKED.iter().any(|known| datatype == *known) {
+                    format!("COALESCE({datatype}(STR(?value)) = ?value, false)")
+                } else {
+                    "true".to_owned()
                 };
                 let body = format!(
                     "FILTER(!isLiteral(?value) || DATATYPE(?value) != {datatype} || !({is_valid}))"
