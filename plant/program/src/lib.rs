@@ -150,9 +150,10 @@ impl Program {
     /// [`NotRunning`] for any run except the current run, and for the success of a suspended run,
     /// because suspended work cannot finish.
     pub fn ended(&mut self, run: RunId, ending: Ending) -> Result<&'static Transition, NotRunning> {
-        let transition = match self.run == Some(run) {
-            true => Transition::by_ending(self.state, ending, self.nature.rests_in),
-            false => None,
+        let transition = if self.run == Some(run) {
+            Transition::by_ending(self.state, ending, self.nature.rests_in)
+        } else {
+            None
         };
         let transition = transition.ok_or(NotRunning { run })?;
         Ok(self.take(transition))
