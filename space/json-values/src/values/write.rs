@@ -148,9 +148,10 @@ fn write_data_value(json: &FieldValue, out: &mut Vec<u8>) -> Written {
     if json.ua_type.is_some() || json.value.is_some() {
         write_variant(json, &mut variant)?;
     }
-    let value = match variant.is_empty() {
-        true => None,
-        false => Some(Encoded::<Variant<'_>>::new(&variant)?.get()?),
+    let value = if variant.is_empty() {
+        None
+    } else {
+        Some(Encoded::<Variant<'_>>::new(&variant)?.get()?)
     };
     let time = |text: &Option<String>, key: &str| match text.as_deref() {
         None => Ok(None),
@@ -284,9 +285,10 @@ fn write_diagnostic_info(json: &Value, out: &mut Vec<u8>) -> Written {
         localized_text: localized_text.transpose()?,
         additional_info: object.get("AdditionalInfo").map(text).transpose()?,
         inner_status_code: object.get("InnerStatusCode").map(status_code).transpose()?,
-        inner: match inner.is_empty() {
-            true => None,
-            false => Some(Encoded::new(&inner)?),
+        inner: if inner.is_empty() {
+            None
+        } else {
+            Some(Encoded::new(&inner)?)
         },
     };
     let mut buffer = Vec::new();
