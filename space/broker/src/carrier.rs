@@ -291,9 +291,10 @@ impl Mqtt {
             }
             return Ok(true);
         }
-        match self.producers.hold(publisher, topic, payload) {
-            true => Ok(false),
-            false => Err("no_room"),
+        if self.producers.hold(publisher, topic, payload) {
+            Ok(false)
+        } else {
+            Err("no_room")
         }
     }
 
@@ -328,9 +329,10 @@ impl Mqtt {
                     return Ok(false);
                 }
                 true if !runs => {
-                    return match self.producers.hold(publisher, topic, payload) {
-                        true => Ok(false),
-                        false => Err("no_room"),
+                    return if self.producers.hold(publisher, topic, payload) {
+                        Ok(false)
+                    } else {
+                        Err("no_room")
                     };
                 }
                 false if !runs => return Err("retained"),
@@ -557,9 +559,10 @@ impl Carrier for Mqtt {
     }
 
     fn senders(&self) -> Senders {
-        match self.broker().acl {
-            true => Senders::Authorized,
-            false => Senders::Hidden,
+        if self.broker().acl {
+            Senders::Authorized
+        } else {
+            Senders::Hidden
         }
     }
 

@@ -199,28 +199,30 @@ pub(crate) fn event(packet: Packet) -> PacketEvent {
         Packet::V3_1_1Connack(packet) => {
             let code = packet.return_code();
             let version = code == mqtt::result_code::ConnectReturnCode::UnacceptableProtocolVersion;
-            match code.is_success() {
-                true => PacketEvent::Accepted(ConnectAck { max_packet: None }),
-                false => PacketEvent::Refused {
+            if code.is_success() {
+                PacketEvent::Accepted(ConnectAck { max_packet: None })
+            } else {
+                PacketEvent::Refused {
                     why: format!("the broker refuses the connection: {code:?}"),
                     version,
-                },
+                }
             }
         }
         Packet::V5_0Connack(packet) => {
             let code = packet.reason_code();
             let version = code == mqtt::result_code::ConnectReasonCode::UnsupportedProtocolVersion;
-            match code == mqtt::result_code::ConnectReasonCode::Success {
-                true => PacketEvent::Accepted(ConnectAck {
+            if code == mqtt::result_code::ConnectReasonCode::Success {
+                PacketEvent::Accepted(ConnectAck {
                     max_packet: packet.props().iter().find_map(|property| match property {
                         Property::MaximumPacketSize(size) => Some(size.val()),
                         _ => None,
                     }),
-                }),
-                false => PacketEvent::Refused {
+                })
+            } else {
+                PacketEvent::Refused {
                     why: format!("the broker refuses the connection: {code:?}"),
                     version,
-                },
+                }
             }
         }
         Packet::V3_1_1Publish(packet) => PacketEvent::Message(ReceivedPublish {

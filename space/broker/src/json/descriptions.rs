@@ -58,9 +58,10 @@ impl Descriptions {
         let fields: Vec<DataSetField> = list.iter().map(field).collect::<Option<_>>()?;
         let (publisher, group, writer) = topic;
         let name = json.get("Name").and_then(Value::as_str).unwrap_or_default();
-        let name = match name.starts_with("ua_") {
-            true => name.to_owned(),
-            false => format!("ua_{publisher}_{group}_{writer} {name}"),
+        let name = if name.starts_with("ua_") {
+            name.to_owned()
+        } else {
+            format!("ua_{publisher}_{group}_{writer} {name}")
         };
         let version = json.get("ConfigurationVersion").unwrap_or(&Value::Null);
         let number = |key: &str| {

@@ -162,9 +162,10 @@ impl Json {
                 .keep_alive(&data_set_header)
                 .map_err(|_| "malformed_json")?;
         } else {
-            let payload = match has_header {
-                true => header.get("Payload").and_then(Value::as_object),
-                false => Some(whole),
+            let payload = if has_header {
+                header.get("Payload").and_then(Value::as_object)
+            } else {
+                Some(whole)
             };
             let payload = payload.ok_or("malformed_json")?;
             let fields = self.fields(topic, payload, faults)?;
