@@ -506,15 +506,12 @@ fn the_mes_is_queried_on_the_page_and_an_engineer_loads_a_file() {
         (view["mes"] == true).then_some(())
     });
     let questions = stranger.get("/knowledge/questions").json();
-    let named = questions["questions"].as_array().unwrap().iter();
-    let nine = named.filter(|question| question["name"] == "state-of");
-    assert_eq!(nine.count(), 1, "{questions}");
+    let mut named = questions["questions"].as_array().unwrap().iter();
+    assert!(named.any(|question| question["name"] == "state-of"));
     let ask = |query: &str| stranger.post("/knowledge/query", &json!({ "query": query }));
     let about = "SELECT ?p ?o { <urn:a> ?p ?o }";
     assert_eq!(ask(about).json()["total"], 0);
-    let wrong = ask("SELECT {");
-    assert_eq!(wrong.code, 400, "{wrong:?}");
-    assert!(!wrong.json()["error"].as_str().unwrap().is_empty());
+    assert_eq!(ask("SELECT {").code, 400);
 
     let file = "<urn:a> <urn:p> <urn:b> , 7 .";
     let load = "/knowledge/load?name=a.ttl";

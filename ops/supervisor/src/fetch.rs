@@ -7,7 +7,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use http_client::header::{HOST, HeaderValue, InvalidHeaderValue};
 use http_client::{Connection, HttpError, Request, Response};
-use hyper::Uri;
+use hyper::{StatusCode, Uri};
 use serde_json::Value;
 use thiserror::Error;
 use tokio::net::TcpStream;
@@ -70,15 +70,20 @@ pub(crate) enum FetchFault {
     /// The request has a value that no header holds.
     #[error("the request cannot be made: {0}")]
     Header(#[from] InvalidHeaderValue),
+    /// The program refuses to return its status.
+    #[error("the response is {0}")]
+    Response(StatusCode),
+    /// The response is not the status of a program.
+    #[error("no status: {0}")]
+    Status(#[source] serde_json::Error),
 }
 
 impl StatusUrl {
     /// Reads the status.
-    pub(crate) async fn fetch(&self) -> Result<Value, String> {
+    pub(crate) async fn fetch(&self) -> Result<Value, FetchFault> {
         let mut request = Request::new(Bytes::new());
         *request.uri_mut() = Uri::from_static("/status");
-        let response = self.send(request, (MOST_BYTES, LIMIT)).await;
-        let response = response.map_err(|fault| fault.to_string())?;
+        let response = self.send(request, (MOST_BYTES, LIMIT)).await?;
         if !response.status().is_success() {
             return Err(FetchFault::Response(response.status()));
         }

@@ -20,7 +20,8 @@ pub(crate) enum ViewFault {
     #[error("topic={0}: a topic is wanted, as ua_1_2_10")]
     Topic(String),
     #[error(
-        "view={0}: there are programs, values, topic, map, skills, processes, alarms and events"
+        "view={0}: there are programs, values, topic, map, skills, processes, knowledge, alarms \
+         and events"
     )]
     View(String),
 }
@@ -110,12 +111,7 @@ impl View {
             "knowledge" => Self::Knowledge,
             "alarms" => Self::Alarms,
             "events" => Self::Events,
-            other => {
-                return Err(format!(
-                    "view={other}: there are programs, values, topic, map, skills, processes, \
-                     knowledge, alarms and events"
-                ));
-            }
+            other => return Err(ViewFault::View(other.to_owned())),
         })
     }
 

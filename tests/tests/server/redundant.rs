@@ -67,6 +67,37 @@ fn settled() -> usize {
     })
 }
 
+/// Checks that a server describes the redundant set.
+fn assert_described(cell: &Cell, at: usize) {
+    eventually("the server describes its redundancy", SOON, || {
+        (value(cell, at, REDUNDANCY_SUPPORT)? == 3).then_some(())
+    });
+    let uris = value(cell, at, SERVER_URI_ARRAY);
+    assert_eq!(
+        uris,
+        Some(json!(["urn:cell:server-1", "urn:cell:server-2"]))
+    );
+    let own = value(cell, at, "i=2254").unwrap();
+    assert_eq!(own[0], format!("urn:cell:server-{}", at + 1));
+    let args = [ENDPOINTS[at], SERVER_REDUNDANCY, "--children"];
+    let below = cell.asyncua_once("opcua_read.py", &args).remove(0);
+    let names = below["names"].as_array().unwrap();
+    assert!(names.contains(&json!("ServerUriArray")), "{below}");
+    // A client of one server finds the endpoints of all of them.
+    let args = ["find-servers", ENDPOINTS[at]];
+    let found = cell.asyncua_once("opcua_discovery.py", &args).remove(0);
+    let found = found["registered"].as_array().unwrap();
+    let found = found.iter().map(|server| (&server["uri"], &server["urls"]));
+    let mut found: Vec<_> = found.collect();
+    found.sort_by_key(|(uri, _)| uri.as_str());
+    let server = |of: usize| {
+        let uri = json!(format!("urn:cell:server-{}", of + 1));
+        (uri, json!([ENDPOINTS[of]]))
+    };
+    let all = [server(0), server(1)];
+    assert_eq!(found, all.each_ref().map(|(uri, urls)| (uri, urls)));
+}
+
 #[test]
 fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_writes() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
@@ -81,33 +112,7 @@ fn a_client_finds_the_active_server_by_the_service_level_and_a_standby_refuses_w
     ];
     let _first = settled();
     for at in [0, 1] {
-        eventually("the server describes its redundancy", SOON, || {
-            (value(&cell, at, REDUNDANCY_SUPPORT)? == 3).then_some(())
-        });
-        let uris = value(&cell, at, SERVER_URI_ARRAY);
-        assert_eq!(
-            uris,
-            Some(json!(["urn:cell:server-1", "urn:cell:server-2"]))
-        );
-        let own = value(&cell, at, "i=2254").unwrap();
-        assert_eq!(own[0], format!("urn:cell:server-{}", at + 1));
-        let args = [ENDPOINTS[at], SERVER_REDUNDANCY, "--children"];
-        let below = cell.asyncua_once("opcua_read.py", &args).remove(0);
-        let names = below["names"].as_array().unwrap();
-        assert!(names.contains(&json!("ServerUriArray")), "{below}");
-        // A client of one server finds the endpoints of all of them.
-        let args = ["find-servers", ENDPOINTS[at]];
-        let found = cell.asyncua_once("opcua_discovery.py", &args).remove(0);
-        let found = found["registered"].as_array().unwrap();
-        let found = found.iter().map(|server| (&server["uri"], &server["urls"]));
-        let mut found: Vec<_> = found.collect();
-        found.sort_by_key(|(uri, _)| uri.as_str());
-        let server = |of: usize| {
-            let uri = json!(format!("urn:cell:server-{}", of + 1));
-            (uri, json!([ENDPOINTS[of]]))
-        };
-        let all = [server(0), server(1)];
-        assert_eq!(found, all.each_ref().map(|(uri, urls)| (uri, urls)));
+        assert_described(&cell, at);
     }
     // The roles may change at any time on a busy machine.
     eventually("the levels show the roles", SOON * 2, || {

@@ -191,7 +191,8 @@ async fn checked(
     if let Some(by) = by {
         let now = page.at().since;
         let may_try = page.sessions().may_try(&by.user, now);
-        may_try.map_err(|why| Refusal::new(StatusCode::TOO_MANY_REQUESTS, why))?;
+        may_try
+            .map_err(|locked| Refusal::new(StatusCode::TOO_MANY_REQUESTS, locked.to_string()))?;
         // Counted before the check, so that attempts at the same time are limited too.
         page.sessions().fail(&by.user, now);
     }
