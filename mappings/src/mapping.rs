@@ -540,6 +540,14 @@ impl Server {
             .collect()
     }
 
+    /// Returns `true` if the server, or each server of a redundant set, is reached and connects on its
+    /// own host only.
+    #[must_use]
+    pub fn is_local(&self) -> bool {
+        let mut endpoints = std::iter::once(&self.endpoint).chain(&self.redundant_endpoints);
+        endpoints.all(Endpoint::is_loopback) && self.connects_to_own_host_only()
+    }
+
     /// Returns `true` if the server connects to no client of another host.
     #[must_use]
     pub fn connects_to_own_host_only(&self) -> bool {

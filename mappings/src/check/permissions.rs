@@ -94,7 +94,7 @@ pub(super) fn anonymous(entry: &ServerEntry) -> Anonymous {
 
 /// Reports permissions that are open to other hosts that reach the server.
 pub(super) fn left_open(entry: &ServerEntry, server: &Server, findings: &mut Findings) {
-    if server.endpoint.is_loopback() && server.connects_to_own_host_only() {
+    if server.is_local() {
         return;
     }
     if let Some((entries, _)) = given(&entry.security)

@@ -332,9 +332,7 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
             without_members(entry.place, group, server, findings);
         }
     }
-    if server.policies(server.endpoint.is_loopback() && server.connects_to_own_host_only())
-        == [SecurityPolicy::None]
-    {
+    if server.policies(server.is_local()) == [SecurityPolicy::None] {
         let message = format!(
             "the server provides the keys of the group `{}` over encrypted sessions only, but offers no encryption",
             short(&group.id)
