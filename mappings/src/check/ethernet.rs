@@ -132,7 +132,7 @@ fn number(
     if range.contains(number) {
         return Some(*number);
     }
-    let message = format!("the {what} {number} does not exist");
+    let message = format!("the {what} {number} is out of range");
     let (least, most) = range.into_inner();
     findings
         .error(Code::WrongValue, place, message)
