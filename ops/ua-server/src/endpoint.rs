@@ -85,12 +85,15 @@ fn list_others(config: &mut ServerConfig, described: &Server) {
     if others.is_empty() {
         return;
     }
-    let Ok(Value::Object(mut settings)) = serde_json::to_value(&*config) else {
-        return;
-    };
-    settings.insert("redundant_servers".to_owned(), others.into());
-    if let Ok(listed) = serde_json::from_value(settings.into()) {
-        *config = listed;
+    let listed = serde_json::to_value(&*config).and_then(|mut settings| {
+        if let Value::Object(settings) = &mut settings {
+            settings.insert("redundant_servers".to_owned(), others.into());
+        }
+        serde_json::from_value(settings)
+    });
+    match listed {
+        Ok(listed) => *config = listed,
+        Err(error) => warn!(%error, "FindServers returns this server only"),
     }
 }
 

@@ -8,7 +8,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bridge_core::{Redundancy, Role};
 use bridge_node::Rank;
@@ -23,9 +23,10 @@ use plant_opcua::server::CoreValue;
 
 /// Returns the other servers of the set of a ranked server, with their endpoints.
 pub(crate) fn others(server: &Server) -> impl Iterator<Item = (&str, &Endpoint)> {
-    let endpoints = match is_member(server) {
-        true => &server.redundant_endpoints[..],
-        false => &[],
+    let endpoints = if is_member(server) {
+        &server.redundant_endpoints[..]
+    } else {
+        &[]
     };
     let servers = server.redundant.iter().map(String::as_str).zip(endpoints);
     servers.filter(|(uri, _)| *uri != server.application_uri)
@@ -130,8 +131,10 @@ impl ServerSet {
         let mut members = self.members.lock();
         let ranks = (1..=Rank::MOST).filter_map(Rank::new);
         for rank in ranks.filter(|rank| Some(*rank) != self.rank) {
-            let mut peers = redundancy.peers(now);
-            let peer = peers.find(|peer| peer.rank() == rank && peer.is_present(now));
+            // A restarted server is a second peer for some time.
+            let peers = redundancy.peers(now);
+            let peers = peers.filter(|peer| peer.rank() == rank && peer.age(now) < LOST_AFTER);
+            let peer = peers.min_by_key(|peer| peer.age(now));
             let seen = peer.map(|peer| {
                 // A server of an earlier version does not send its level.
                 let by_role = match peer.role() {
@@ -231,6 +234,9 @@ const NONE: i32 = 0;
 const HOT: i32 = 3;
 /// The ServiceLevel of a server that this server does not reach: clients do not connect to it.
 const UNREACHABLE: u8 = 0;
+/// The time without a heartbeat after which a server is shown as unknown. It is longer than a short
+/// stall of this program, unlike the limit of a takeover.
+const LOST_AFTER: Duration = Duration::from_millis(500);
 /// The ServiceLevel of a server without data.
 const NO_DATA: u8 = 1;
 /// The best ServiceLevel of a server with parts that are not available.
@@ -319,7 +325,7 @@ mod tests {
         assert!(set.take_change().is_none());
 
         set.set_own(255);
-        set.follow(&own, now.monotonic + std::time::Duration::from_secs(1));
+        set.follow(&own, now.monotonic + Duration::from_secs(1));
         assert_eq!(shown(), [unknown, (255, ServerState::Running)]);
         assert!(set.take_change().is_some());
         assert_eq!(ServerSet::new(mapping.server(), None).own(), None);
