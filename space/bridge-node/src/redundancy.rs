@@ -75,7 +75,11 @@ pub(crate) fn check(flags: &Flags, mapping: &Mapping, spaces: &[SpaceId]) -> Res
         Some(url) => is_mqtt(url),
         None => mapping.pubsub().broker.is_some(),
     };
-    if flags.address.is_none() && !mapping.pubsub().carriers.is_empty() {
+    let carriers = mapping.pubsub().carriers.len();
+    if flags.address.is_none() && carriers == 1 {
+        return refuse("redundant bridges need UDP multicast, and the carrier is Ethernet");
+    }
+    if flags.address.is_none() && carriers > 1 {
         return refuse(
             "redundant bridges need one carrier, UDP multicast, and `pubsub` is a list: the lease of the active \
              bridge does not hold on several networks. Make `pubsub` a map with the group only, and let a program \
