@@ -68,10 +68,15 @@ fn open_all(
 ) -> Result<WithOptions<Vec<Box<dyn Carrier>>>, Failure> {
     let mut carriers = Vec::new();
     let mut first = None;
+    // The programs of a process meet at one carrier, so that each message arrives once.
+    let meet_by_udp = listed
+        .iter()
+        .any(|carrier| matches!(carrier.medium, CarrierMedium::Udp(_)));
+    let ethernet_hub = hub.filter(|_| !meet_by_udp);
     for ConfiguredCarrier { medium, .. } in listed {
         let carrier = match medium {
             CarrierMedium::Mqtt(broker) => open_broker(broker, identity)?,
-            CarrierMedium::Ethernet(group) => open_ethernet(group, arguments, hub)?,
+            CarrierMedium::Ethernet(group) => open_ethernet(group, arguments, ethernet_hub)?,
             CarrierMedium::Udp(group) => {
                 let options = udp_options(arguments, group, several)?;
                 let udp = open_udp(&options, hub)?;
