@@ -197,6 +197,24 @@ impl Ethernet {
         None
     }
 
+    /// Receives the next message. Faulty frames end the turn, so that they leave time for other work.
+    fn receive(&mut self, buffer: &mut Vec<u8>) -> Turn {
+        for _ in 0..FILLS {
+            if let Some(received) = self.take(buffer) {
+                return Turn::Received(Ok(received));
+            }
+            match self.fill() {
+                Ok(true) => {}
+                Ok(false) => {
+                    let last = self.take(buffer);
+                    return last.map_or(Turn::Empty, |received| Turn::Received(Ok(received)));
+                }
+                Err(error) => return Turn::Received(Err(error)),
+            }
+        }
+        Turn::Faulty
+    }
+
     /// Receives the frames that wait in the socket. Returns whether more may wait.
     fn fill(&mut self) -> io::Result<bool> {
         let (batch, socket) = (&mut self.batch, &self.sockets.frames);
@@ -249,25 +267,23 @@ impl Carrier for Ethernet {
         buffer: &mut Vec<u8>,
     ) -> Poll<io::Result<Received>> {
         loop {
-            if let Some(received) = self.try_recv(buffer) {
-                return Poll::Ready(received);
+            match self.receive(buffer) {
+                Turn::Received(received) => return Poll::Ready(received),
+                Turn::Empty => {}
+                Turn::Faulty => {
+                    cx.waker().wake_by_ref();
+                    return Poll::Pending;
+                }
             }
             let _still_ready = ready!(self.sockets.frames.poll_read_ready(cx))?;
         }
     }
 
     fn try_recv(&mut self, buffer: &mut Vec<u8>) -> Option<io::Result<Received>> {
-        for _ in 0..FILLS {
-            if let Some(received) = self.take(buffer) {
-                return Some(Ok(received));
-            }
-            match self.fill() {
-                Ok(true) => {}
-                Ok(false) => return self.take(buffer).map(Ok),
-                Err(error) => return Some(Err(error)),
-            }
+        match self.receive(buffer) {
+            Turn::Received(received) => Some(received),
+            Turn::Empty | Turn::Faulty => None,
         }
-        None
     }
 
     fn follow(&mut self) -> Option<CarrierChange> {
@@ -330,6 +346,15 @@ fn header(options: &EthernetOptions, port: &EthernetPort) -> Vec<u8> {
     header.encode()
 }
 
+/// The result of a turn of receiving.
+enum Turn {
+    Received(io::Result<Received>),
+    /// Nothing waits in the socket.
+    Empty,
+    /// All frames of the turn were faulty, and more may wait.
+    Faulty,
+}
+
 #[derive(Debug)]
 struct Sockets {
     frames: AsyncFd<Socket>,
@@ -362,7 +387,7 @@ impl Sockets {
             }
         })?;
         socket
-            .attach_filter(&filter::program(options.vlan()))
+            .attach_filter(&filter::program(options.vlan(), port.index()))
             .map_err(at("set the filter"))?;
         socket
             .set_nonblocking(true)
@@ -410,8 +435,11 @@ fn registered(socket: Socket) -> io::Result<AsyncFd<Socket>> {
 fn drain(socket: &Socket) {
     let mut socket = socket;
     for _ in 0..MOST_DRAINED {
-        if socket.read(&mut [0]).is_err() {
-            return;
+        match socket.read(&mut [0]) {
+            Ok(_) => {}
+            // An interface that is down is reported once, before the frames.
+            Err(error) if error.kind() == io::ErrorKind::NetworkDown => {}
+            Err(_) => return,
         }
     }
 }

@@ -11,8 +11,9 @@ use super::frame::ETHERTYPE;
 ///
 /// Frames that this host sends are dropped, also those of other programs. The kernel marks a frame
 /// of a VLAN that the host does not know as a frame for another host, where the filter is for
-/// frames outside of all VLANs.
-pub(super) fn program(vlan: Option<u16>) -> Vec<SockFilter> {
+/// frames outside of all VLANs. A frame of a VLAN that the host knows arrives from the interface of
+/// that VLAN, so that it does not have the index of the own interface.
+pub(super) fn program(vlan: Option<u16>, index: u32) -> Vec<SockFilter> {
     let mut program = vec![
         SockFilter::new(LOAD_WORD, 0, 0, PACKET_TYPE),
         SockFilter::new(JUMP_IF_AT_LEAST, 0, 1, OTHER_HOST),
@@ -29,6 +30,12 @@ pub(super) fn program(vlan: Option<u16>) -> Vec<SockFilter> {
             SockFilter::new(LOAD_WORD, 0, 0, TAG),
             SockFilter::new(AND, 0, 0, VLAN_BITS),
             SockFilter::new(JUMP_IF_EQUAL, 1, 0, u32::from(vlan)),
+            drop_frame(),
+        ]);
+    } else {
+        program.extend([
+            SockFilter::new(LOAD_WORD, 0, 0, INTERFACE),
+            SockFilter::new(JUMP_IF_EQUAL, 1, 0, index),
             drop_frame(),
         ]);
     }
@@ -53,6 +60,7 @@ const RETURN: u16 = 0x06;
 const ETHERTYPE_AT: u32 = 12;
 // Offsets of what the kernel knows about a frame, from `SKF_AD_OFF`.
 const PACKET_TYPE: u32 = 0xFFFF_F000 + 4;
+const INTERFACE: u32 = 0xFFFF_F000 + 8;
 const TAG: u32 = 0xFFFF_F000 + 44;
 const TAG_PRESENT: u32 = 0xFFFF_F000 + 48;
 /// The bits of the VLAN in a tag.
