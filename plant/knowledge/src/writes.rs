@@ -331,8 +331,13 @@ impl Site {
         let path = request.uri().path().to_owned();
         let (kind, name) = named(path.strip_prefix("/check").unwrap_or_default())?;
         let files = Arc::clone(&self.may_write(&request).await?.files);
+        let place = CHECKS.acquire().await.map_err(|error| failed(&error))?;
         let contents = self.upload(request, LARGEST_FILE).await?;
-        let checked = tokio::task::spawn_blocking(move || files.check(kind, &name, &contents));
+        // A check goes on after its client has left, and keeps its place.
+        let checked = tokio::task::spawn_blocking(move || {
+            let _place = place;
+            files.check(kind, &name, &contents)
+        });
         match checked.await {
             Ok(checked) => Ok(json_page(&json!(checked))),
             Err(error) => Err(failed(&error)),
@@ -447,6 +452,8 @@ pub(crate) fn failed(error: &dyn fmt::Display) -> Refusal {
 
 /// Concurrent uploads, each of which is in memory as a whole.
 static UPLOADS: Semaphore = Semaphore::const_new(2);
+/// Concurrent checks of sources.
+static CHECKS: Semaphore = Semaphore::const_new(2);
 const LARGEST_FILE: usize = 256 << 20;
 const LONGEST_NAME: usize = 256;
 const LARGEST_JOB: usize = 4096;
