@@ -146,7 +146,8 @@ impl ListingTask {
                 let servers = servers.into_iter().map(listed).collect();
                 let servers = self.listing.answered(servers, clock::now());
                 if before.is_some() || self.answered.is_none() {
-                    let (listed, ignored) = (servers.len(), self.listing.ignored().len());
+                    let listed = servers.len();
+                    let ignored: u64 = self.listing.ignored().values().sum();
                     info!(gds, listed, ignored, "the Global Discovery Server answers");
                 }
                 self.answered = Some(clock::wall());
