@@ -41,13 +41,15 @@ export function show(root, { session }) {
       say(summary, several(told.questions.length, "named question"));
     } catch (error) {
       render(body, error.message, () => [empty("The MES does not answer", error.message)]);
+      setTimeout(() => { if (root.isConnected && !upload) load(); }, 3000);
     }
   };
   return {
     title: "Knowledge",
     query: () => "view=knowledge",
     update(data) {
-      if (data.mes === mes || data.mes === null) return;
+      // A late status does not remove a form in use.
+      if (data.mes === mes || data.mes === null || (upload && !data.mes)) return;
       mes = data.mes;
       load();
     },
@@ -180,7 +182,7 @@ function form(session, largest) {
       }
       load.disabled = answer.loaded || !answer.accepted;
       found.replaceChildren(...findings(file.name, answer));
-      if (answer.loaded) { input.value = ""; input.focus(); } else if (answer.accepted) load.focus();
+      if (answer.loaded) { input.value = ""; password.value = ""; secret.hidden = true; input.focus(); } else if (answer.accepted) load.focus();
       announce(answer.loaded ? `${file.name} is loaded` : answer.accepted ? `${file.name} can be loaded` : `${file.name} cannot be loaded`);
     } catch (error) {
       say(fault, error.message);

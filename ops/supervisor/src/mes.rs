@@ -63,7 +63,7 @@ pub(crate) enum MesFault {
     #[error("ua-mes does not answer: {0}")]
     Fetch(#[from] FetchFault),
     /// The response is too large, or ended early.
-    #[error("the result has more than {} MiB, or ended early: add a LIMIT to the query", LARGEST_RESULT >> 20)]
+    #[error("the response of ua-mes has more than {} MiB, or ended early: a query may need a LIMIT", LARGEST_RESULT >> 20)]
     TooLarge,
     /// `ua-mes` has refused the request.
     #[error("{message}")]
@@ -95,7 +95,7 @@ impl Mes {
         Self(at)
     }
 
-    /// Returns whether a status is that of `ua-mes`.
+    /// Returns whether `ua-mes` has sent a status.
     pub(crate) fn is_status(status: &Value) -> bool {
         status.get("processes").is_some()
     }

@@ -50,6 +50,15 @@ impl Sessions {
         self.failed.push_back((now, crate::value::cut(user, 64)));
     }
 
+    /// Forgets the newest failed attempt of a user, which was not wrong.
+    pub(crate) fn forgive(&mut self, user: &str) {
+        let user = crate::value::cut(user, 64);
+        let newest = self.failed.iter().rposition(|(_, failed)| *failed == user);
+        if let Some(newest) = newest {
+            self.failed.remove(newest);
+        }
+    }
+
     /// Forgets the failed attempts of a user who has signed in.
     pub(crate) fn succeed(&mut self, user: &str) {
         self.failed.retain(|(_, failed)| failed != user);
@@ -176,7 +185,13 @@ mod tests {
         assert!(sessions.may_try("anna", at(1)).is_err());
         assert_eq!(sessions.may_try("bert", at(1)), Ok(()));
         assert_eq!(sessions.may_try("anna", at(61)), Ok(()));
+        for _ in 0..MOST_FAILED_OF_USER {
+            sessions.fail("anna", at(99));
+        }
+        sessions.forgive("anna");
+        assert_eq!(sessions.may_try("anna", at(99)), Ok(()));
         sessions.fail("anna", at(99));
+        assert!(sessions.may_try("anna", at(99)).is_err());
         sessions.succeed("anna");
         for number in 0..MOST_FAILED {
             sessions.fail(&number.to_string(), at(100));

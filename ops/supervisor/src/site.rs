@@ -13,9 +13,7 @@ use bridge_node::{BoxFuture, PageBody, Site, Statuses, Visit, full};
 use bytes::Bytes;
 use http_body_util::{BodyExt as _, Limited};
 use hyper::body::{Body, Incoming};
-use hyper::header::{
-    ALLOW, CONTENT_TYPE, COOKIE, HOST, HeaderMap, HeaderName, HeaderValue, ORIGIN,
-};
+use hyper::header::{ALLOW, CONTENT_TYPE, COOKIE, HOST, HeaderMap, HeaderValue, ORIGIN};
 use hyper::{Method, Request, Response, StatusCode};
 use mappings::TopicId;
 use serde::Deserialize;
@@ -178,6 +176,8 @@ impl Page {
                 Ok(with_headers("text/event-stream", events.boxed_unsync()))
             }
             knowledge::QUESTIONS | knowledge::PLAN => {
+                // A plan is work for `ua-mes`, which the page of another site must not cause.
+                check_site(request.headers())?;
                 check_reader(&browser)?;
                 visit.keep_open();
                 knowledge::read(&self, request.uri()).await
@@ -561,12 +561,23 @@ fn check_origin(headers: &HeaderMap, own: &str, media: &str) -> Result<(), Refus
             .get(name)
             .and_then(|value: &HeaderValue| value.to_str().ok())
     };
-    let site = text(HeaderName::from_static("sec-fetch-site"));
+    check_site(headers)?;
     let origin = text(ORIGIN);
     let is_own = origin.is_none_or(|origin| origin == own);
     let is_media = text(CONTENT_TYPE).is_some_and(|sent| sent.starts_with(media));
-    if site.is_some_and(|site| site != "same-origin") || !is_own || !is_media {
+    if !is_own || !is_media {
         let why = format!("only the page itself may send this, as {media}");
+        return Err(Refusal::new(StatusCode::FORBIDDEN, why));
+    }
+    Ok(())
+}
+
+/// Checks that no page of another site has sent a request. Programs other than browsers do not name
+/// a site.
+fn check_site(headers: &HeaderMap) -> Result<(), Refusal> {
+    let site = headers.get("sec-fetch-site");
+    if site.is_some_and(|site| site != "same-origin") {
+        let why = "only the page itself may send this";
         return Err(Refusal::new(StatusCode::FORBIDDEN, why));
     }
     Ok(())

@@ -5,6 +5,7 @@
 use std::collections::HashMap;
 
 use serde::Deserialize;
+use serde::de::{Deserializer, IgnoredAny, SeqAccess, Visitor};
 use serde_json::{Map, Value, json};
 use thiserror::Error;
 
@@ -41,7 +42,45 @@ struct Head {
 
 #[derive(Deserialize)]
 struct Solutions {
-    bindings: Vec<HashMap<String, Term>>,
+    bindings: Bindings,
+}
+
+/// The first [`MOST_ROWS`] solutions, and the number of all.
+#[derive(Default)]
+struct Bindings {
+    rows: Vec<HashMap<String, Term>>,
+    total: usize,
+}
+
+impl<'de> Deserialize<'de> for Bindings {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_seq(BindingsVisitor)
+    }
+}
+
+struct BindingsVisitor;
+
+impl<'de> Visitor<'de> for BindingsVisitor {
+    type Value = Bindings;
+
+    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("a list of solutions")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut all: A) -> Result<Bindings, A::Error> {
+        let mut read = Bindings::default();
+        while read.rows.len() < MOST_ROWS {
+            match all.next_element()? {
+                Some(row) => read.rows.push(row),
+                None => break,
+            }
+        }
+        read.total = read.rows.len();
+        while all.next_element::<IgnoredAny>()?.is_some() {
+            read.total += 1;
+        }
+        Ok(read)
+    }
 }
 
 #[derive(Deserialize)]
@@ -76,7 +115,7 @@ fn solutions(results: Results) -> Value {
     let columns = results.head.vars;
     let all = results.results.map(|solutions| solutions.bindings);
     let all = all.unwrap_or_default();
-    let rows = all.iter().take(MOST_ROWS).map(|row| {
+    let rows = all.rows.iter().map(|row| {
         let cells = columns.iter().map(|column| {
             row.get(column).map_or(Value::Null, |term| {
                 let of = (term.datatype.as_deref(), term.language.as_deref());
@@ -85,7 +124,7 @@ fn solutions(results: Results) -> Value {
         });
         cells.collect()
     });
-    table("select", &columns, rows.collect(), all.len())
+    table("select", &columns, rows.collect(), all.total)
 }
 
 /// Reads expanded JSON-LD, whose nodes are in a list.

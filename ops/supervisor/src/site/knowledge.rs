@@ -137,7 +137,7 @@ fn require_role(operations: &dyn Operations, user: &str) -> Result<(), Refusal> 
     Err(Refusal::new(StatusCode::FORBIDDEN, why))
 }
 
-/// Logs what was done with a file.
+/// Logs the check or the load of a file.
 fn report(user: &str, file: &SourceFile, outcome: &str) {
     let (kind, source, size) = (file.kind, cut(&file.name, 100), file.contents.len());
     info!(
@@ -166,7 +166,10 @@ async fn source_file(request: Request<impl RequestBody>) -> Result<SourceFile, R
         return Err(Refusal::new(StatusCode::BAD_REQUEST, why));
     }
     let contents = file(request).await?;
-    let kind = source_kind(&name, &contents).ok_or_else(|| {
+    // The search of a large file would keep the thread of the program.
+    let searched = (name.clone(), contents.clone());
+    let kind = tokio::task::spawn_blocking(move || source_kind(&searched.0, &searched.1)).await;
+    let kind = kind.ok().flatten().ok_or_else(|| {
         let why = format!(
             "`{}` is no source: send .aml, .mtp, .amlx, .ttl, .nt, .bpmn, .batchml, or .xml with a \
              NodeSet, a manifest or a recipe",
@@ -197,12 +200,16 @@ async fn checked(
         page.sessions().fail(&by.user, now);
     }
     let checked = mes.check(file, by).await;
-    if let Some(by) = by.filter(|_| checked.is_ok()) {
-        page.sessions().succeed(&by.user);
+    let is_wrong = matches!(
+        &checked,
+        Err(MesFault::Refused { status, .. }) if *status == StatusCode::UNAUTHORIZED
+    );
+    if let Some(by) = by.filter(|_| !is_wrong) {
+        page.sessions().forgive(&by.user);
     }
     let mut answer = match checked {
         Ok(answer) => answer,
-        Err(MesFault::Refused { status, .. }) if status == StatusCode::UNAUTHORIZED => {
+        Err(_) if is_wrong => {
             return Ok(json!({ "needs_password": true, "accepted": false, "loaded": false }));
         }
         Err(fault) => return Err(refusal(fault)),
@@ -276,7 +283,7 @@ fn busy(of: &str) -> Refusal {
 
 fn refusal(fault: MesFault) -> Refusal {
     let status = match &fault {
-        // The session of the page is another one.
+        // The user is still signed in on the page.
         MesFault::Refused { status, .. } if *status == StatusCode::UNAUTHORIZED => {
             StatusCode::FORBIDDEN
         }

@@ -1,3 +1,5 @@
+use hyper::header::HeaderName;
+
 use super::*;
 
 const MEDIA: &str = "application/json";

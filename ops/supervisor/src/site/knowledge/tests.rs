@@ -12,7 +12,7 @@ use super::*;
 use crate::operations::{ConditionChange, ConditionState, OperationFault};
 use crate::program::Program;
 
-/// Users whose name is their role.
+/// Users with the role that their name says.
 struct Users;
 
 impl Operations for Users {
@@ -199,6 +199,22 @@ async fn without_a_mes_the_option_is_named() {
         let (status, body) = send(&page, (Method::GET, path), &[], "").await;
         let why = body["error"].as_str().unwrap();
         assert!(status == 404 && why.contains("--status"), "{path}: {why}");
+    }
+}
+
+#[tokio::test]
+async fn another_site_causes_no_plan() {
+    let page = Page::new("test", Vec::new(), None);
+    for (site, expected) in [
+        ("same-origin", 404),
+        ("cross-site", 403),
+        ("same-site", 403),
+    ] {
+        for path in [QUESTIONS, "/knowledge/plan?process=urn:p"] {
+            let from = [("sec-fetch-site", site)];
+            let (status, _) = send(&page, (Method::GET, path), &from, "").await;
+            assert_eq!(status, expected, "{path} from {site}");
+        }
     }
 }
 
