@@ -1,5 +1,5 @@
-//! More than one broker: a NATS cluster of three, whose nodes are stopped and killed beside commands
-//! and killed under a load of states, and two mosquittos with a bridge.
+//! Several brokers: a NATS cluster of three nodes and two mosquittos with a bridge. Nodes are stopped
+//! and killed while commands and states are sent.
 
 use std::time::Duration;
 
