@@ -540,8 +540,8 @@ impl Server {
             .collect()
     }
 
-    /// Returns `true` if the server, or each server of a redundant set, is reached and connects on its
-    /// own host only.
+    /// Returns `true` if the server, or each server of a redundant set, is reached and connects on
+    /// its own host only.
     #[must_use]
     pub fn is_local(&self) -> bool {
         let mut endpoints = std::iter::once(&self.endpoint).chain(&self.redundant_endpoints);

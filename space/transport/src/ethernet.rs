@@ -197,7 +197,8 @@ impl Ethernet {
         None
     }
 
-    /// Receives the next message. Faulty frames end the turn, so that they leave time for other work.
+    /// Receives the next message. Faulty frames end the turn, so that they leave time for other
+    /// work.
     fn receive(&mut self, buffer: &mut Vec<u8>) -> Turn {
         for _ in 0..FILLS {
             if let Some(received) = self.take(buffer) {

@@ -1,5 +1,5 @@
-//! Several brokers: a NATS cluster of three nodes and two mosquittos with a bridge. Nodes are stopped
-//! and killed while commands and states are sent.
+//! Several brokers: a NATS cluster of three nodes and two mosquittos with a bridge. Nodes are
+//! stopped and killed while commands and states are sent.
 
 use std::time::Duration;
 
@@ -84,9 +84,9 @@ fn ends(receives: &Child, within: Duration) {
     });
 }
 
-/// Kills the third node while states cross from the first to the second. Each state that bridge-ros2
-/// had not delivered when the last arrived is counted. A subscriber sees the newest of several
-/// states that arrive at once.
+/// Kills the third node while states cross from the first to the second. Each state that
+/// bridge-ros2 had not delivered when the last arrived is counted. A subscriber sees the newest of
+/// several states that arrive at once.
 fn crosses_beside_a_dying_node(cell: &Cell, qos: u8, within: Duration) {
     let mut cluster = cell.nats("", &[]);
     let _master = cell.roscore();
