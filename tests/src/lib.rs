@@ -66,8 +66,8 @@ pub use numbered::{Numbered, numbered};
 pub use peers::MASTER;
 pub use plant::{Segment, Site};
 pub use programs::{
-    METRICS_CELL, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number,
-    program,
+    METRICS_CELL, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops,
+    drops_by_reason, number, program,
 };
 pub use relay::{OTHER_GROUP, Relay, Weather};
 pub use rtps::{Mutator, announced, claims_too_much, queued};

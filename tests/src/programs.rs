@@ -1,6 +1,7 @@
 //! The programs under test, located and started as users start them.
 
 use std::{
+    collections::BTreeMap,
     env, fs,
     path::{Path, PathBuf},
     time::Duration,
@@ -151,18 +152,34 @@ pub fn number(status: &Value, key: &str) -> u64 {
 /// Returns the number of samples and datagrams that a program dropped, for any reason.
 #[must_use]
 pub fn drops(status: &Value) -> u64 {
+    drops_by_reason(status).values().sum()
+}
+
+/// Returns the dropped values of a status by reason.
+#[must_use]
+pub fn drops_by_reason(status: &Value) -> BTreeMap<String, u64> {
+    let mut sums = BTreeMap::new();
+    add_drops(status, &mut sums);
+    sums
+}
+
+fn add_drops(status: &Value, sums: &mut BTreeMap<String, u64>) {
     match status {
-        Value::Object(fields) => fields
-            .iter()
-            .map(|(name, value)| match value.as_object() {
-                Some(reasons) if name == "dropped" => {
-                    reasons.values().filter_map(Value::as_u64).sum()
+        Value::Object(fields) => {
+            for (name, value) in fields {
+                match value.as_object() {
+                    Some(reasons) if name == "dropped" => {
+                        for (reason, count) in reasons {
+                            *sums.entry(reason.clone()).or_default() +=
+                                count.as_u64().unwrap_or_default();
+                        }
+                    }
+                    _ => add_drops(value, sums),
                 }
-                _ => drops(value),
-            })
-            .sum(),
-        Value::Array(items) => items.iter().map(drops).sum(),
-        _ => 0,
+            }
+        }
+        Value::Array(items) => items.iter().for_each(|item| add_drops(item, sums)),
+        _ => {}
     }
 }
 

@@ -80,12 +80,12 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
     let mut nodes = nodes(&cell);
     listed(&[("ua_1_2_10", JOINTS), ("ua_1_2_11", TWIST)]);
     let mut recording = ua_space(&["record", text(&values), "--count", "30", "--json"]).start();
-    let (code, recorded) = ended(&["record", text(&packets), "--count", "60", "--json"]);
+    let (code, recorded) = ended(&["record", text(&packets), "--count", "120", "--json"]);
     assert_eq!(code, 0, "{recorded}");
     let summary = recorded.json_lines().pop().unwrap();
     assert_eq!(
         (&summary["messages"], &summary["slow_disk"]),
-        (&json!(60), &json!(0))
+        (&json!(120), &json!(0))
     );
     // Own probes are no messages that the socket lost.
     assert_eq!(summary["full_socket"], json!(0), "{recorded}");
@@ -101,7 +101,7 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
 
     let columns = ["-T", "fields", "-e", "frame.time_epoch", "-e", "uadp.topic"];
     let shown = cell.tshark_of(&packets, &columns);
-    assert_eq!(shown.lines().count(), 60, "{shown}");
+    assert_eq!(shown.lines().count(), 120, "{shown}");
     assert!(shown.contains("ua_1_2_10"), "{shown}");
     let malformed = cell.tshark_of(&packets, &["-Y", "uadp.malformed || _ws.malformed"]);
     assert_eq!(malformed, "");
@@ -132,13 +132,13 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
     let mut before = 0;
     // A second replay repeats sequence numbers and values, and is delivered all the same.
     for turn in 1..=2 {
-        // At a fifth of the speed most values follow the discovery, on slow hosts too.
-        let words = ["replay", text(&packets), "--speed", "0.2", "--json"];
+        // At half the speed most values follow the discovery, on slow hosts too.
+        let words = ["replay", text(&packets), "--speed", "0.5", "--json"];
         let (code, replayed) = ended(&words);
         assert_eq!(code, 0, "{replayed}");
         let summary = replayed.json_lines().pop().unwrap();
         let sent = summary["sent"].as_u64().unwrap();
-        assert!((10..60).contains(&sent), "{summary}");
+        assert!((20..120).contains(&sent), "{summary}");
         eventually("most values of the replay are in ROS 2", SOON, || {
             let count = joints_there.values().len();
             (count >= before + 10).then_some(())
@@ -149,7 +149,7 @@ fn a_recording_opens_elsewhere_and_drives_a_bridge_without_its_commands() {
     let got = joints_there.wait_for_json("joints", SOON, |line| line.get("value").cloned());
     assert_eq!(got["position"], json!([0.5, -0.25]), "{got}");
     assert_eq!(commands_there.values(), Vec::<Value>::new());
-    let words = ["replay", text(&packets), "--commands", "--speed", "0.2"];
+    let words = ["replay", text(&packets), "--commands", "--speed", "0.5"];
     let (code, replayed) = ended(&words);
     assert_eq!(code, 0, "{replayed}");
     eventually("the commands of the replay are in ROS 2", SOON, || {

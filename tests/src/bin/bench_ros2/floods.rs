@@ -1,8 +1,9 @@
 //! Higher rates than both bridges can carry.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
-use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, drops, metrics, now};
+use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, drops, drops_by_reason, metrics, now};
 
 use crate::ends::{Pace, SILENCE_MS};
 use crate::through::{NAMES, Ways};
@@ -29,7 +30,7 @@ fn flood(ways: &mut Ways, way: usize, floods: u64) {
                 burst: 0,
                 pause: Duration::ZERO,
             };
-            let before = bridges_dropped();
+            let before = bridges_reasons();
             let start = now();
             let mut report = ways.send(way, pace);
             let mut took = now().saturating_sub(start);
@@ -43,7 +44,7 @@ fn flood(ways: &mut Ways, way: usize, floods: u64) {
                 "| {} | {shown} | {ticks} | {} | {} | {taken:.0} | {:.1} | {:.1} |",
                 NAMES[way],
                 ticks - report.distinct,
-                bridges_dropped() - before,
+                increase(&before, &bridges_reasons()),
                 report.times.at(0.5) / 1000.0,
                 report.times.at(1.0) / 1000.0
             );
@@ -56,6 +57,38 @@ pub(crate) fn bridges_dropped() -> u64 {
     let bridges = [METRICS_ROS1, METRICS_ROS2];
     let statuses = bridges.into_iter().filter_map(metrics);
     statuses.map(|status| drops(&status)).sum()
+}
+
+/// Returns the number of samples that both bridges have dropped, by reason.
+fn bridges_reasons() -> BTreeMap<String, u64> {
+    let mut sums = BTreeMap::new();
+    for status in [METRICS_ROS1, METRICS_ROS2].into_iter().filter_map(metrics) {
+        for (reason, count) in drops_by_reason(&status) {
+            *sums.entry(reason).or_default() += count;
+        }
+    }
+    sums
+}
+
+/// Returns the increases of counters as a text, the largest first.
+fn increase(before: &BTreeMap<String, u64>, after: &BTreeMap<String, u64>) -> String {
+    let mut increases: Vec<(u64, &str)> = after
+        .iter()
+        .map(|(reason, count)| {
+            let former = before.get(reason).copied().unwrap_or_default();
+            (count.saturating_sub(former), reason.as_str())
+        })
+        .filter(|(count, _)| *count > 0)
+        .collect();
+    if increases.is_empty() {
+        return "0".to_owned();
+    }
+    increases.sort_unstable_by(|one, other| other.cmp(one));
+    let texts: Vec<String> = increases
+        .iter()
+        .map(|(count, reason)| format!("{count} {reason}"))
+        .collect();
+    texts.join(", ")
 }
 
 const WAITING: u32 = 10_000;
