@@ -184,8 +184,10 @@ impl<P: Port> Shell<P> {
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
             more |= self.drain();
-            if more && self.turn == Turn::Shared {
-                // The other program of the thread passes on the values of this turn first.
+            if more {
+                // The other tasks of the thread pass on the values of this turn first: the event
+                // loop of DDS, or another program. The budget of a task counts polls, and a poll
+                // handles many datagrams.
                 tokio::task::yield_now().await;
             }
             if self.taps.is_on() || self.router.is_tapped() {
