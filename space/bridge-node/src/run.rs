@@ -196,14 +196,16 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// Handles a datagram and the datagrams queued behind it, up to a limit, and carries out each
-    /// before the next is read. Under a flood, the other branches are then polled once for many
+    /// Handles a datagram and the datagrams queued behind it, up to a number of datagrams and of
+    /// bytes, and carries out each before the next is read. Under a flood, the other branches are then polled once for many
     /// datagrams. Returns whether more datagrams may be queued.
     fn heard_all(&mut self, first: io::Result<Received>, buffer: &mut Vec<u8>) -> bool {
         let mut heard = first;
-        for _ in 0..self.turn.length() {
+        let mut limits = self.turn.limits();
+        loop {
+            let size = heard.as_ref().map_or(0, |received| received.length);
             self.heard(heard, buffer);
-            if self.drain() {
+            if self.drain() || !limits.goes_on_after(size) {
                 return true;
             }
             match self.carrier.try_recv(buffer) {
@@ -211,9 +213,6 @@ impl<P: Port> Shell<P> {
                 Some(next) => heard = next,
             }
         }
-        // The last datagram was read and must not be lost.
-        self.heard(heard, buffer);
-        true
     }
 
     /// Handles the events of the port as [`heard_all`](Self::heard_all) handles datagrams. If
