@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, drops, drops_by_reason, metrics, now};
+use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, drops, drops_by_reason, metrics, now, number};
 
 use crate::ends::{Pace, SILENCE_MS};
 use crate::through::{NAMES, Ways};
@@ -59,13 +59,15 @@ pub(crate) fn bridges_dropped() -> u64 {
     statuses.map(|status| drops(&status)).sum()
 }
 
-/// Returns the number of samples that both bridges have dropped, by reason.
+/// Returns the number of samples that both bridges have dropped, by reason, or have missed by their
+/// sequence numbers.
 fn bridges_reasons() -> BTreeMap<String, u64> {
     let mut sums = BTreeMap::new();
     for status in [METRICS_ROS1, METRICS_ROS2].into_iter().filter_map(metrics) {
         for (reason, count) in drops_by_reason(&status) {
             *sums.entry(reason).or_default() += count;
         }
+        *sums.entry("missing".to_owned()).or_default() += number(&status, "missing");
     }
     sums
 }
