@@ -745,6 +745,27 @@ async def _(server):
     return ", ".join(found)
 
 
+@row(
+    "CreateSubscription",
+    "5.14.2",
+    "lifetimes and keep-alives in intervals of 500 ms",
+    "10000 and 3000 are 1200 and 400, 100 and 10 are 100 and 10",
+)
+async def _(server):
+    found = []
+    for lifetime, keep_alive in ((10_000, 3_000), (100, 10)):
+        made = await server.ask(
+            "CreateSubscription",
+            RequestedPublishingInterval=500.0,
+            RequestedLifetimeCount=lifetime,
+            RequestedMaxKeepAliveCount=keep_alive,
+        )
+        await server.ask("DeleteSubscriptions", SubscriptionIds=[made.SubscriptionId])
+        revised = f"{made.RevisedLifetimeCount} and {made.RevisedMaxKeepAliveCount}"
+        found.append(f"{lifetime} and {keep_alive} are {revised}")
+    return ", ".join(found)
+
+
 @row("ModifySubscription", "5.14.3", "publishing intervals", "0 is 10, 125.5 is 125.5")
 async def _(server):
     subscription, found = await server.subscribed(), []

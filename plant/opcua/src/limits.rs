@@ -21,6 +21,9 @@ pub const MOST_CHUNKS: usize = 2_100;
 pub const POLL_MS: u64 = 5;
 /// Shortest publishing interval of a server.
 pub const SHORTEST_PUBLISHING: Duration = Duration::from_millis(10);
+/// Longest lifetime of a subscription that is not durable. It bounds the memory that vanished
+/// clients leave behind.
+pub const LONGEST_LIFETIME: Duration = Duration::from_secs(600);
 /// Maximum number of notifications in a response. Many clients refuse arrays of more than 1000
 /// elements, and then receive no further notifications.
 pub const MOST_NOTIFICATIONS: usize = 1_000;
@@ -150,6 +153,10 @@ impl ClientLimits {
             ("max_requests_in_flight", REQUESTS_IN_FLIGHT),
         ] {
             all.insert(name.to_owned(), limit.into());
+        }
+        if let Some(serde_json::Value::Object(subscriptions)) = all.get_mut("subscriptions") {
+            let longest = LONGEST_LIFETIME.as_secs().saturating_mul(1_000);
+            subscriptions.insert("max_lifetime_ms".to_owned(), longest.into());
         }
         serde_json::from_value(all.into()).unwrap_or(limits)
     }
