@@ -1,14 +1,16 @@
-//! Values of clients on their way out: a Write is answered when its value has been sent.
+//! Values of clients on their way out: a Write is answered when its value has been sent, or when it
+//! is known that the value is not sent.
 //!
 //! The value passes from a thread of the server to the run loop, and the result comes back. Both
 //! threads poll for a short time before they sleep, because waking a thread takes longer than
 //! sending a value.
 
+use std::collections::{HashMap, VecDeque};
 use std::sync::LazyLock;
 use std::thread::available_parallelism;
 use std::time::Duration;
 
-use bridge_node::{BusyPoll, Reason};
+use bridge_node::{BusyPoll, Reason, Unsent, Verdict};
 use mappings::TopicId;
 use opcua::types::StatusCode;
 use tokio::sync::oneshot;
@@ -45,9 +47,10 @@ impl Departing {
     /// Waits until the value has been sent.
     ///
     /// # Errors
-    /// Returns `BadInvalidState` if another server is active, `BadCommunicationError` if the value
-    /// was not sent for another reason, `BadShutdown` if the server stopped, and `BadTimeout` if
-    /// the run loop does not answer. The outcome of the last two is unknown.
+    /// Returns `BadInvalidState` if another server is active, `BadRequestCancelledByRequest` if a
+    /// newer write replaced the value, `BadCommunicationError` if the value was not sent for
+    /// another reason, `BadShutdown` if the server stopped, and `BadTimeout` if the value still
+    /// waits. The outcome of the last two is unknown.
     pub(crate) async fn left(mut self) -> Result<(), StatusCode> {
         let result = match self.poll().await {
             Some(result) => result,
@@ -80,15 +83,70 @@ impl Departing {
     }
 }
 
-/// The values that the run loop has received and not sent yet. At most one batch of events.
+/// The writes whose values the run loop has received and not sent yet.
+///
+/// Each topic has at most as many entries as its queue in the Router has places, and one more for a
+/// value that waits because of `at_most`.
 #[derive(Debug)]
 pub(crate) struct Leaving {
-    values: Vec<(TopicId, Departure)>,
-    /// The reported value that the run loop has not handled. The run loop may send the values
-    /// before it first, and their results are not those of this value.
-    reported: Vec<(TopicId, Departure)>,
+    topics: HashMap<TopicId, TopicWrites>,
+    /// The topics in the order of [`drained`](Self::drained). An answered topic stays until its
+    /// turn.
+    order: VecDeque<TopicId>,
+    /// The writes of the reported value that the run loop has not handled. The run loop may send
+    /// the values before it first, and their results are not those of this value.
+    reported: Vec<Departure>,
     /// Polls for the next write of a client that waits for each result.
     next: BusyPoll,
+}
+
+/// The unsent values of a topic, in the order of the Router. A value that was not written by a
+/// client has no departure.
+#[derive(Debug, Default)]
+struct TopicWrites {
+    /// The values in the queue of the Router, from the oldest.
+    queued: VecDeque<Vec<Departure>>,
+    /// The newest value, if it waits because of `at_most`.
+    held: Option<Vec<Departure>>,
+}
+
+impl TopicWrites {
+    fn is_empty(&self) -> bool {
+        self.queued.is_empty() && self.held.is_none()
+    }
+
+    /// Adds a value of a newer write. The Router has one held value at most, and has dropped the
+    /// oldest values if its queue was full.
+    fn add(&mut self, departures: Vec<Departure>, unsent: Unsent) {
+        answer(self.held.take(), REPLACED);
+        if unsent.is_held {
+            self.held = Some(departures);
+        } else {
+            self.queued.push_back(departures);
+        }
+        while self.queued.len() > unsent.queued {
+            answer(self.queued.pop_front(), REPLACED);
+        }
+    }
+
+    /// Adds a write that changes nothing. The Router drops the held value for it.
+    fn add_unchanged(&mut self, departures: Vec<Departure>) {
+        answer(self.held.take(), REPLACED);
+        match self.queued.back_mut() {
+            Some(last) => last.extend(departures),
+            None => answer(Some(departures), StatusCode::Good),
+        }
+    }
+
+    /// Removes the oldest value that is not in the queue of the Router any more.
+    fn next_gone(&mut self, unsent: Unsent) -> Option<Vec<Departure>> {
+        if !unsent.is_held {
+            self.queued.extend(self.held.take());
+        }
+        (self.queued.len() > unsent.queued)
+            .then(|| self.queued.pop_front())
+            .flatten()
+    }
 }
 
 impl Default for Leaving {
@@ -99,7 +157,8 @@ impl Default for Leaving {
             Duration::ZERO
         };
         Self {
-            values: Vec::new(),
+            topics: HashMap::new(),
+            order: VecDeque::new(),
             reported: Vec::new(),
             next: BusyPoll::new(window),
         }
@@ -108,47 +167,83 @@ impl Default for Leaving {
 
 impl Leaving {
     /// Adds a value that is passed on to the run loop.
-    pub(crate) fn add(&mut self, topic: TopicId, departure: Departure) {
+    pub(crate) fn add(&mut self, departure: Departure) {
         self.next.arrived(bridge_node::now().monotonic);
-        self.reported.push((topic, departure));
+        self.reported.push(departure);
     }
 
-    /// Records that the run loop has handled the reported value, or answers its write if the value
-    /// is dropped.
-    pub(crate) fn handled(&mut self, taken: Result<(), Reason>) {
-        if taken.is_ok() {
-            self.values.append(&mut self.reported);
+    /// Records the verdict of the run loop for the reported value of a topic, or for a value that
+    /// no client wrote. Answers the writes whose values are dropped or replaced.
+    pub(crate) fn handled(&mut self, topic: TopicId, verdict: Verdict, unsent: Unsent) {
+        let departures = std::mem::take(&mut self.reported);
+        match verdict {
+            Verdict::Drop(Reason::Unchanged) => match self.topics.get_mut(&topic) {
+                Some(writes) => writes.add_unchanged(departures),
+                // The value was sent before.
+                None => answer(Some(departures), StatusCode::Good),
+            },
+            Verdict::Drop(reason) => answer(Some(departures), status(Err(reason))),
+            Verdict::Forward | Verdict::ForwardAfterDroppingOldest => {
+                if departures.is_empty() && !self.topics.contains_key(&topic) {
+                    return;
+                }
+                let writes = self.topics.entry(topic).or_insert_with(|| {
+                    self.order.push_back(topic);
+                    TopicWrites::default()
+                });
+                writes.add(departures, unsent);
+            }
+        }
+    }
+
+    /// Answers the oldest write of a topic, if its value has left the queue of the Router. The
+    /// datagram may also be a repetition, or a later chunk of a value.
+    pub(crate) fn left(&mut self, topic: TopicId, sent: Result<(), Reason>, unsent: Unsent) {
+        let Some(writes) = self.topics.get_mut(&topic) else {
             return;
-        }
-        for (_, departure) in self.reported.drain(..) {
-            departure.answer(status(taken));
-        }
-    }
-
-    /// Answers the writes of a topic.
-    pub(crate) fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
-        let left = self.values.extract_if(.., |(of, _)| *of == topic);
-        for (_, departure) in left {
-            departure.answer(status(sent));
-        }
-    }
-
-    /// Answers all handled writes: their values equal the previous ones, wait for their turn, or
-    /// are not sent because another server is active.
-    pub(crate) fn drained(&mut self, is_muted: bool) {
-        let status = if is_muted {
-            NOT_ACTIVE
-        } else {
-            StatusCode::Good
         };
-        for (_, departure) in self.values.drain(..) {
-            departure.answer(status);
+        answer(writes.next_gone(unsent), status(sent));
+        if writes.is_empty() {
+            self.topics.remove(&topic);
+        }
+    }
+
+    /// Answers the writes whose values the Router has dropped, of some topics in turn. If another
+    /// server is active, no value is sent.
+    pub(crate) fn drained(&mut self, is_muted: bool, unsent: impl Fn(TopicId) -> Unsent) {
+        for _ in 0..self.order.len().min(CHECKED_AT_ONCE) {
+            let Some(topic) = self.order.pop_front() else {
+                return;
+            };
+            let Some(writes) = self.topics.get_mut(&topic) else {
+                continue;
+            };
+            let (unsent, status) = if is_muted {
+                (Unsent::default(), NOT_ACTIVE)
+            } else {
+                (unsent(topic), StatusCode::BadCommunicationError)
+            };
+            while let Some(departures) = writes.next_gone(unsent) {
+                answer(Some(departures), status);
+            }
+            if writes.is_empty() {
+                self.topics.remove(&topic);
+            } else {
+                self.order.push_back(topic);
+            }
         }
     }
 
     /// Returns whether the run loop polls for the next write instead of sleeping.
     pub(crate) fn polls(&mut self) -> bool {
         self.next.looks(|| bridge_node::now().monotonic)
+    }
+}
+
+/// Answers the writes of a value.
+fn answer(departures: Option<Vec<Departure>>, status: StatusCode) {
+    for departure in departures.into_iter().flatten() {
+        departure.answer(status);
     }
 }
 
@@ -167,8 +262,12 @@ static SEVERAL_CORES: LazyLock<bool> =
 
 /// The status of a write while another server is active.
 pub(crate) const NOT_ACTIVE: StatusCode = StatusCode::BadInvalidState;
+/// The status of a write whose value a newer write replaced before it was sent.
+const REPLACED: StatusCode = StatusCode::BadRequestCancelledByRequest;
 /// Time limit for a write to be sent by the run loop.
 pub(crate) const LONGEST_WAY_OUT: Duration = Duration::from_secs(10);
+/// The number of topics with unsent values that are checked for drops after a turn of the run loop.
+const CHECKED_AT_ONCE: usize = 32;
 /// Duration of polling before a thread sleeps.
 const POLLING: Duration = Duration::from_micros(200);
 
@@ -176,36 +275,103 @@ const POLLING: Duration = Duration::from_micros(200);
 mod tests {
     use super::*;
 
-    fn topic(identifier: u16) -> TopicId {
-        TopicId::new(0, 2, identifier).unwrap()
+    /// The writes of topic 30 beside a Router.
+    #[derive(Default)]
+    struct Writes {
+        leaving: Leaving,
+        unsent: Unsent,
     }
 
-    /// Returns the answer to a write of topic 30 after these steps of the run loop.
-    async fn answer(steps: impl FnOnce(&mut Leaving)) -> Result<(), StatusCode> {
-        let mut leaving = Leaving::default();
-        let (departure, departing) = departure();
-        leaving.add(topic(30), departure);
-        // The values before it were sent.
-        leaving.left(topic(30), Ok(()));
-        leaving.drained(false);
-        leaving.handled(Ok(()));
-        steps(&mut leaving);
-        drop(leaving);
-        departing.left().await
+    impl Writes {
+        fn topic(identifier: u16) -> TopicId {
+            TopicId::new(0, 2, identifier).unwrap()
+        }
+
+        /// Reports a value. Afterwards, the Router has these unsent values.
+        fn write(&mut self, verdict: Verdict, queued: usize, is_held: bool) -> Departing {
+            let (departure, departing) = departure();
+            self.leaving.add(departure);
+            self.unsent = Unsent { queued, is_held };
+            self.leaving.handled(Self::topic(30), verdict, self.unsent);
+            departing
+        }
+
+        /// Sends a datagram of the topic. Afterwards, the queue of the Router has that many values.
+        fn leave(&mut self, sent: Result<(), Reason>, queued: usize) {
+            self.unsent.queued = queued;
+            self.leaving.left(Self::topic(30), sent, self.unsent);
+        }
+
+        fn drain(&mut self, is_muted: bool) {
+            let unsent = self.unsent;
+            self.leaving.drained(is_muted, |_| unsent);
+        }
+    }
+
+    /// Returns the answer that has arrived, or `None`.
+    fn answer_of(departing: &mut Departing) -> Option<StatusCode> {
+        departing.0.try_recv().ok()
     }
 
     #[tokio::test]
-    async fn a_write_is_good_only_if_its_value_was_sent_or_waits_for_its_turn() {
-        let sent = answer(|leaving| leaving.left(topic(30), Ok(()))).await;
-        assert_eq!(sent, Ok(()));
-        let waits = answer(|leaving| leaving.drained(false)).await;
-        assert_eq!(waits, Ok(()));
-        let other = answer(|leaving| leaving.left(topic(31), Ok(()))).await;
-        assert_eq!(
-            other,
-            Err(StatusCode::BadShutdown),
-            "another topic was sent"
-        );
+    async fn a_write_is_good_when_its_value_has_been_sent() {
+        let mut writes = Writes::default();
+        let mut departing = writes.write(Verdict::Forward, 1, false);
+        // The value waits for its turn, and another topic is sent.
+        writes.drain(false);
+        let unsent = writes.unsent;
+        writes.leaving.left(Writes::topic(31), Ok(()), unsent);
+        assert_eq!(answer_of(&mut departing), None);
+        writes.leave(Ok(()), 0);
+        writes.drain(false);
+        assert_eq!(departing.left().await, Ok(()));
+        assert!(writes.leaving.topics.is_empty() && writes.leaving.order.is_empty());
+    }
+
+    #[tokio::test]
+    async fn a_write_without_a_change_is_answered_with_the_value_before_it() {
+        let unchanged = Verdict::Drop(Reason::Unchanged);
+        let mut writes = Writes::default();
+        let sent_before = writes.write(unchanged, 0, false);
+        assert_eq!(sent_before.left().await, Ok(()));
+        let queued = writes.write(Verdict::Forward, 1, false);
+        let mut same = writes.write(unchanged, 1, false);
+        assert_eq!(answer_of(&mut same), None);
+        writes.leave(Err(Reason::NotSent), 0);
+        assert_eq!(queued.left().await, Err(StatusCode::BadCommunicationError));
+        assert_eq!(same.left().await, Err(StatusCode::BadCommunicationError));
+    }
+
+    #[tokio::test]
+    async fn a_value_that_waits_for_its_time_is_good_when_it_leaves_or_cancelled_by_a_newer_one() {
+        let mut writes = Writes::default();
+        let first = writes.write(Verdict::Forward, 0, true);
+        let mut second = writes.write(Verdict::Forward, 0, true);
+        assert_eq!(first.left().await, Err(REPLACED));
+        // An earlier value is repeated meanwhile.
+        writes.leave(Ok(()), 0);
+        writes.drain(false);
+        assert_eq!(answer_of(&mut second), None);
+        writes.unsent.is_held = false;
+        writes.leave(Ok(()), 0);
+        assert_eq!(second.left().await, Ok(()));
+    }
+
+    #[tokio::test]
+    async fn the_oldest_value_of_a_full_queue_is_cancelled_and_the_others_leave_in_order() {
+        let overflow = Verdict::ForwardAfterDroppingOldest;
+        let mut writes = Writes::default();
+        let first = writes.write(Verdict::Forward, 1, false);
+        let second = writes.write(Verdict::Forward, 2, false);
+        let mut third = writes.write(overflow, 2, false);
+        assert_eq!(first.left().await, Err(REPLACED));
+        writes.leave(Ok(()), 1);
+        assert_eq!(second.left().await, Ok(()));
+        // A second chunk of the same value.
+        writes.leave(Ok(()), 1);
+        assert_eq!(answer_of(&mut third), None);
+        writes.leave(Ok(()), 0);
+        assert_eq!(third.left().await, Ok(()));
     }
 
     #[tokio::test]
@@ -215,14 +381,22 @@ mod tests {
             (Reason::NotSent, StatusCode::BadCommunicationError),
             (Reason::SpaceTaken, StatusCode::BadCommunicationError),
         ] {
-            let told = answer(|leaving| {
-                leaving.left(topic(30), Err(reason));
-                leaving.drained(false);
-            });
-            assert_eq!(told.await, Err(status), "{reason}");
+            let mut writes = Writes::default();
+            let failed = writes.write(Verdict::Forward, 1, false);
+            writes.leave(Err(reason), 0);
+            assert_eq!(failed.left().await, Err(status), "{reason}");
+            let refused = writes.write(Verdict::Drop(reason), 0, false);
+            assert_eq!(refused.left().await, Err(status), "{reason}");
         }
-        let muted = answer(|leaving| leaving.drained(true)).await;
-        assert_eq!(muted, Err(StatusCode::BadInvalidState));
+        let mut writes = Writes::default();
+        // The Router drops the values of a namespace that another program has.
+        let dropped = writes.write(Verdict::Forward, 1, false);
+        writes.unsent = Unsent::default();
+        writes.drain(false);
+        assert_eq!(dropped.left().await, Err(StatusCode::BadCommunicationError));
+        let muted = writes.write(Verdict::Forward, 0, true);
+        writes.drain(true);
+        assert_eq!(muted.left().await, Err(StatusCode::BadInvalidState));
         let (departure, departing) = departure();
         departure.refuse();
         assert_eq!(departing.left().await, Err(StatusCode::BadInvalidState));
@@ -230,14 +404,10 @@ mod tests {
 
     #[tokio::test]
     async fn a_write_that_is_dropped_does_not_answer_the_write_before_it() {
-        let mut leaving = Leaving::default();
-        let (first, queued) = departure();
-        let (second, dropped) = departure();
-        leaving.add(topic(30), first);
-        leaving.handled(Ok(()));
-        leaving.add(topic(30), second);
-        leaving.handled(Err(Reason::TooBig));
-        leaving.left(topic(30), Ok(()));
+        let mut writes = Writes::default();
+        let queued = writes.write(Verdict::Forward, 1, false);
+        let dropped = writes.write(Verdict::Drop(Reason::TooBig), 1, false);
+        writes.leave(Ok(()), 0);
         assert_eq!(queued.left().await, Ok(()));
         assert_eq!(dropped.left().await, Err(StatusCode::BadCommunicationError));
     }

@@ -16,6 +16,7 @@ use std::sync::Arc;
 use bridge_node::{
     Answered, Application, Arrival, AskId, CallDescription, Delivery, Described, Execution,
     ExecutionId, Failure, FailureKind, LinkState, Port, PortEvent, Rank, Reason, Router, TypePaths,
+    Verdict,
 };
 use bytes::Bytes;
 use discovery::AnnounceSettings;
@@ -317,16 +318,16 @@ impl Port for ServerPort {
         // Values of every type have a node.
     }
 
-    fn handled(&mut self, _topic: TopicId, taken: Result<(), Reason>) {
-        self.writes.handled(taken);
+    fn handled(&mut self, topic: TopicId, verdict: Verdict, router: &Router) {
+        self.writes.handled(topic, verdict, router);
     }
 
-    fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
-        self.writes.left(topic, sent);
+    fn left(&mut self, topic: TopicId, sent: Result<(), Reason>, router: &Router) {
+        self.writes.left(topic, sent, router);
     }
 
-    fn drained(&mut self, is_muted: bool) {
-        self.writes.drained(is_muted);
+    fn drained(&mut self, is_muted: bool, router: &Router) {
+        self.writes.drained(is_muted, router);
     }
 
     fn settled(&mut self, topic: TopicId, arrival: &Arrival) {

@@ -118,6 +118,16 @@ impl Gate {
         self.held.take()
     }
 
+    /// Records that a published sample was not sent: the next one differs from it.
+    pub(crate) fn forget_last(&mut self) {
+        self.last.clear();
+    }
+
+    /// Returns whether a sample waits.
+    pub(crate) const fn holds(&self) -> bool {
+        self.held.is_some()
+    }
+
     /// Returns the time at which the waiting sample may be published.
     pub(crate) fn due(&self) -> Option<Instant> {
         self.held.as_ref().and(self.opens)

@@ -69,7 +69,7 @@ pub use guard::{GroupState, Guard, KeyDelivery, Unopened, policy_of};
 pub use hops::{Delays, Hop, Hops};
 pub use late::is_aged;
 pub use loop_rule::{Owned, Side, What, may_cross};
-pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
+pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey, Unsent};
 pub use redundancy::{
     Heartbeat, MuteCause, Rank, Redundancy, RedundancyCounts, RedundantPeer, Role, RoleChange,
     SwitchRefusal, Takeover, TakeoverCause,

@@ -186,6 +186,15 @@ impl Output {
     }
 }
 
+/// The samples of an own topic that are not sent yet.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Unsent {
+    /// The number of samples in the queue, without a message that is partly sent.
+    pub queued: usize,
+    /// Whether the newest sample waits for its time behind the queue, because of `at_most`.
+    pub is_held: bool,
+}
+
 /// Identifies a latched publisher of the local side among the publishers of its topic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct PublisherKey(pub u32);

@@ -55,6 +55,11 @@ impl<T> Queue<T> {
         self.items.len() >= self.depth
     }
 
+    /// Returns the number of waiting samples.
+    pub(crate) fn len(&self) -> usize {
+        self.items.len()
+    }
+
     pub(crate) fn is_empty(&self) -> bool {
         self.items.is_empty()
     }

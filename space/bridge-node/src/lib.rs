@@ -46,7 +46,7 @@ pub use bridge_core::{
     ActionFamily, Answered, Application, Arrival, AskError, AskErrorKind, AskId, CallDescription,
     CallField, CallMap, CallRole, CallStructure, Counters, Described, Executed, ExecutionId,
     Handover, Kept, Offered, OfferedType, Owned, PublisherKey, Rank, Reason, Refusal, Room, Router,
-    ValueDescription, ValueNote,
+    Unsent, ValueDescription, ValueNote, Verdict,
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};

@@ -8,7 +8,7 @@ use std::time::Duration;
 use bridge_core::{
     Answered, Application, Arrival, AskId, CallDescription, CallMap, Described, Executed,
     ExecutionId, Handover, Kept, Offered, OfferedType, PublisherKey, Reason, Router,
-    ValueDescription, ValueNote,
+    ValueDescription, ValueNote, Verdict,
 };
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
@@ -46,23 +46,24 @@ pub trait Port: Send + 'static {
         Handover::Done
     }
 
-    /// Notes that a reported sample was handled, or the reason why it was dropped. Otherwise its
-    /// result follows by [`left`](Self::left) or [`drained`](Self::drained); earlier calls of these
-    /// are about earlier samples.
-    fn handled(&mut self, topic: TopicId, taken: Result<(), Reason>) {
-        let _nobody_waits = (topic, taken);
+    /// Notes the verdict for a reported sample. The result of a sample that is not dropped follows
+    /// by [`left`](Self::left) or [`drained`](Self::drained); earlier calls of these are about
+    /// earlier samples. [`Router::unsent`] returns which samples wait.
+    fn handled(&mut self, topic: TopicId, verdict: Verdict, router: &Router) {
+        let _nobody_waits = (topic, verdict, router);
     }
 
-    /// Notes that a sample of this side was sent to the group, or the reason why it is not sent.
-    fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
-        let _nobody_waits = (topic, sent);
+    /// Notes that a datagram with a sample of this side was sent to the group, or the reason why it
+    /// is not sent. The sample may be a repetition, or one of the chunks of a large sample.
+    fn left(&mut self, topic: TopicId, sent: Result<(), Reason>, router: &Router) {
+        let _nobody_waits = (topic, sent, router);
     }
 
     /// Notes that the outputs of all handled events were carried out. A handled sample that has
-    /// not [`left`](Self::left) equals the previous sample or waits for its turn; if this program
-    /// is muted because another program is active, it is not sent.
-    fn drained(&mut self, is_muted: bool) {
-        let _nobody_waits = is_muted;
+    /// not [`left`](Self::left) waits for its turn or was dropped; if this program is muted because
+    /// another program is active, it is not sent.
+    fn drained(&mut self, is_muted: bool, router: &Router) {
+        let _nobody_waits = (is_muted, router);
     }
 
     /// Receives the outcome of the newest value of a topic of this side that bridges confirm.

@@ -400,7 +400,8 @@ impl<P: Port> Shell<P> {
                 let now = now();
                 self.busy.arrived(now.monotonic);
                 let verdict = self.router.handle_local(heard, now);
-                self.judged(topic, verdict);
+                // The Router has counted a drop.
+                self.port.handled(topic, verdict, &self.router);
             }
             PortEvent::Qualified {
                 topic,
@@ -472,7 +473,7 @@ impl<P: Port> Shell<P> {
             let Some(output) = self.router.poll_output(now()) else {
                 self.flush();
                 let is_muted = self.is_muted();
-                self.port.drained(is_muted);
+                self.port.drained(is_muted, &self.router);
                 return false;
             };
             if !matches!(output, Output::Datagram { .. }) {

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use bridge_node::{Arrival, PortEvent, Reason};
+use bridge_node::{Arrival, PortEvent, Reason, Router, Verdict};
 use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::mpsc;
 
@@ -49,19 +49,19 @@ impl ClientWrites {
         self.leaving.polls()
     }
 
-    /// Records that the run loop has handled the reported value, or why it dropped the value.
-    pub(super) fn handled(&mut self, taken: Result<(), Reason>) {
-        self.leaving.handled(taken);
+    /// Records the verdict of the run loop for the reported value.
+    pub(super) fn handled(&mut self, topic: TopicId, verdict: Verdict, router: &Router) {
+        self.leaving.handled(topic, verdict, router.unsent(topic));
     }
 
-    /// Records the result of sending a value.
-    pub(super) fn left(&mut self, topic: TopicId, sent: Result<(), Reason>) {
-        self.leaving.left(topic, sent);
+    /// Records the result of sending a datagram.
+    pub(super) fn left(&mut self, topic: TopicId, sent: Result<(), Reason>, router: &Router) {
+        self.leaving.left(topic, sent, router.unsent(topic));
     }
 
-    /// Records that the run loop has sent all values.
-    pub(super) fn drained(&mut self, is_muted: bool) {
-        self.leaving.drained(is_muted);
+    /// Records that the run loop has sent all values that do not wait.
+    pub(super) fn drained(&mut self, is_muted: bool, router: &Router) {
+        self.leaving.drained(is_muted, |topic| router.unsent(topic));
     }
 
     /// Returns the next start or end of the production of a topic.
@@ -96,7 +96,7 @@ impl ClientWrites {
         awaited: Option<Awaited>,
     ) {
         self.commanders.wrote(topic, commander);
-        self.leaving.add(topic, departure);
+        self.leaving.add(departure);
         self.confirms.supersede(topic);
         self.confirms.arrivals.sent(topic, awaited);
     }

@@ -152,6 +152,9 @@ impl Values {
             while entry.take(&mut self.buffers).is_some() {
                 dropped += 1;
             }
+            if let Some(gate) = &mut entry.gate {
+                gate.forget_last();
+            }
             self.count(
                 About::topic(topic),
                 (Reason::SpaceTaken, "withheld"),

@@ -6,7 +6,7 @@ use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::message::Message;
 use crate::network::chunk;
-use crate::output::Output;
+use crate::output::{Output, Unsent};
 use crate::settings::{Link, Now};
 use crate::tap::Crossing;
 use crate::topic::{Item, Role, Sending};
@@ -83,11 +83,24 @@ impl Router {
         entry.is_some_and(|entry| entry.queue.is_full())
     }
 
+    /// Returns the samples of a topic that wait to be sent.
+    #[must_use]
+    pub fn unsent(&self, topic: TopicId) -> Unsent {
+        let entry = self.values.topics.get(&topic);
+        entry.map_or_else(Unsent::default, |entry| Unsent {
+            queued: entry.queue.len(),
+            is_held: entry.gate.as_ref().is_some_and(|gate| gate.holds()),
+        })
+    }
+
     /// Records a datagram that could not be sent, and counts it under `reason` with `detail` for
     /// one of its topics. The rest of a large message is not sent either.
     pub fn not_sent(&mut self, topic: TopicId, reason: Reason, detail: &str) {
         if let Some(entry) = self.values.topics.get_mut(&topic) {
             entry.sending = None;
+            if let Some(gate) = &mut entry.gate {
+                gate.forget_last();
+            }
         }
         self.values
             .count(About::topic(topic), (reason, "socket"), 1, || {

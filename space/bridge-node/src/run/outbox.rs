@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use bridge_core::{Reason, Redundancy, Verdict};
+use bridge_core::{Reason, Redundancy};
 use mappings::TopicId;
 use transport::{Outgoing, SendError};
 
@@ -81,22 +81,13 @@ impl<P: Port> Shell<P> {
         redundancy.is_some_and(Redundancy::mutes_group)
     }
 
-    /// Reports that a sample of the port was handled, and the verdict if it is dropped. The Router
-    /// has counted it. An unchanged sample was sent before.
-    pub(super) fn judged(&mut self, topic: TopicId, verdict: Verdict) {
-        let taken = match verdict {
-            Verdict::Drop(reason) if reason != Reason::Unchanged => Err(reason),
-            Verdict::Drop(_) | Verdict::Forward | Verdict::ForwardAfterDroppingOldest => Ok(()),
-        };
-        self.port.handled(topic, taken);
-    }
-
     fn parcel_left(&mut self, parcel: Parcel, sent: Result<(), (Reason, &str)>) {
         for topic in std::iter::once(parcel.topic).chain(parcel.with) {
             if let Err((reason, detail)) = sent {
                 self.router.not_sent(topic, reason, detail);
             }
-            self.port.left(topic, sent.map_err(|(reason, _)| reason));
+            let sent = sent.map_err(|(reason, _)| reason);
+            self.port.left(topic, sent, &self.router);
         }
         self.router.recycle(parcel.bytes);
     }
