@@ -314,7 +314,7 @@ fn compile(
         nodesets: files,
         ..network::server(document.server.as_ref(), findings)
     };
-    let near = (&server.endpoint, &namespaces);
+    let near = (&server, &namespaces);
     let servers = servers::check(document.servers.as_ref(), near, findings);
     let variables = match &document.variables {
         Some(entries) => {
@@ -338,7 +338,7 @@ fn compile(
                 spaces: &spaces,
                 namespaces: &namespaces,
                 variables: &variables,
-                server: &server.endpoint,
+                server: &server,
                 servers: &servers,
             };
             calls::check(entries, known, &mut types, findings)
@@ -353,7 +353,7 @@ fn compile(
     let groups = groups
         .and_then(|at| at.value.as_deref())
         .unwrap_or_default();
-    let security = security::check(groups, &server.endpoint, findings);
+    let security = security::check(groups, &server, findings);
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
     *used = types.used();
     let mapping = mapping

@@ -544,8 +544,30 @@ impl Server {
     /// its own host only.
     #[must_use]
     pub fn is_local(&self) -> bool {
-        let mut endpoints = std::iter::once(&self.endpoint).chain(&self.redundant_endpoints);
-        endpoints.all(Endpoint::is_loopback) && self.connects_to_own_host_only()
+        self.endpoints().all(Endpoint::is_loopback) && self.connects_to_own_host_only()
+    }
+
+    /// Returns the endpoints of the server, or of all servers of a redundant set.
+    pub fn endpoints(&self) -> impl Iterator<Item = &Endpoint> {
+        std::iter::once(&self.endpoint).chain(&self.redundant_endpoints)
+    }
+
+    /// Returns the endpoint of the server, or of the first server of a redundant set. This server
+    /// creates the keys of secured groups.
+    #[must_use]
+    pub fn first_endpoint(&self) -> &Endpoint {
+        self.redundant_endpoints.first().unwrap_or(&self.endpoint)
+    }
+
+    /// Returns whether the server creates the keys of secured groups, by its ApplicationUri. The
+    /// other servers of a redundant set request them.
+    #[must_use]
+    pub fn creates_keys(&self) -> bool {
+        let rank = self
+            .redundant
+            .iter()
+            .position(|uri| *uri == self.application_uri);
+        rank.is_none_or(|rank| rank == 0)
     }
 
     /// Returns `true` if the server connects to no client of another host.

@@ -5,8 +5,8 @@ use std::num::NonZeroU16;
 use std::time::Duration;
 
 use mappings::{
-    CarrierMedium, Checked, Code, EthernetGroup, Mapping, Overflow, PubSub, PublisherIdRule,
-    SecurityPolicy, ServiceRole, SpaceId, TopicId, Trigger, UaField,
+    CarrierMedium, Checked, Code, EthernetGroup, KeySource, Mapping, Overflow, PubSub,
+    PublisherIdRule, SecurityPolicy, ServiceRole, SpaceId, TopicId, Trigger, UaField,
 };
 use messages::{Conversion, Leaf, Literal, Part, Rank, Selected, Selection};
 use proptest::prelude::*;
@@ -79,6 +79,37 @@ fn redundant_servers_have_an_endpoint_each() {
     ] {
         let checked = Mapping::from_yaml(&text(faulty), "cell.yaml");
         assert_eq!(codes(&checked), [Code::Endpoint], "{faulty}");
+    }
+}
+
+#[test]
+fn the_first_server_of_a_redundant_set_creates_the_keys_and_all_belong_to_the_cell() {
+    const SET: &str = ", redundant_endpoints: [\"opc.tcp://host-a\", \"opc.tcp://host-b\"]";
+    const KEYS: &str = "security: [{group: cell, keys: {sks: {members: [\"urn:x\"]}}}]\n";
+    let text = |set: &str, more: &str| {
+        format!(
+            "spaces: [{{id: 1}}]\nserver: {{security: [Basic256Sha256], \
+             redundant: [\"urn:cell:a\", \"urn:cell:b\"]{set}}}\n{more}"
+        )
+    };
+    let mapping = sound(&text(SET, KEYS));
+    let Some(KeySource::Own(served)) = &mapping.security()[0].keys else {
+        panic!("the keys are not those of the cell");
+    };
+    assert_eq!(served.endpoint.to_string(), "opc.tcp://host-a:4840");
+    let creates = |rank| mapping.for_rank(rank).unwrap().server().creates_keys();
+    assert_eq!([creates(1), creates(2)], [true, false]);
+    assert!(mapping.server().creates_keys(), "a server without a rank");
+    let second = "security: [{group: cell, keys: {sks: {endpoint: \"opc.tcp://host-b:4840\"}}}]\n";
+    let server = "servers: [{name: plc, endpoint: \"opc.tcp://host-b:4840\"}]\n";
+    for (set, more, code) in [
+        ("", KEYS, Code::KeyService),
+        (SET, second, Code::KeyService),
+        (SET, server, Code::Servers),
+    ] {
+        let text = text(set, more);
+        let checked = Mapping::from_yaml(&text, "cell.yaml");
+        assert!(codes(&checked).contains(&code), "{}", checked.render(&text));
     }
 }
 

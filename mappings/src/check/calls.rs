@@ -18,7 +18,7 @@ use crate::code::Code;
 use crate::document::{AcknowledgesEntry, CallEntry};
 use crate::endpoint::Endpoint;
 use crate::findings::Findings;
-use crate::mapping::Variable;
+use crate::mapping::{Server, Variable};
 use crate::node_id::NodeIdText;
 use crate::read::{At, given, short};
 use crate::topic::{SpaceId, TopicId};
@@ -34,8 +34,8 @@ pub(super) struct Known<'k> {
     pub(super) spaces: &'k Spaces,
     pub(super) namespaces: &'k Namespaces,
     pub(super) variables: &'k [Variable],
-    /// Endpoint of the cell's own server.
-    pub(super) server: &'k Endpoint,
+    /// The cell's own server.
+    pub(super) server: &'k Server,
     pub(super) servers: &'k Servers,
 }
 

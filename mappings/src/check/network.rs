@@ -469,8 +469,9 @@ pub(super) fn remote_endpoint(
 }
 
 /// Returns `true` for the endpoint of the cell's own server.
-pub(super) fn is_own(endpoint: &Endpoint, own: &Endpoint) -> bool {
-    endpoint.host.eq_ignore_ascii_case(&own.host) && endpoint.port == own.port
+pub(super) fn is_own(endpoint: &Endpoint, own: &Server) -> bool {
+    own.endpoints()
+        .any(|own| endpoint.host.eq_ignore_ascii_case(&own.host) && endpoint.port == own.port)
 }
 
 fn security(

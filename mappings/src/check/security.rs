@@ -26,10 +26,10 @@ const LIFETIME: Duration = Duration::from_secs(3600);
 /// Shortest lifetime of a key: programs need time to get the next one.
 const LEAST_LIFETIME: Duration = Duration::from_secs(2);
 
-/// Checks the groups. `server` is the endpoint of the cell's own server.
+/// Checks the groups. `server` is the cell's own server.
 pub(super) fn check(
     entries: &[At<GroupEntry>],
-    server: &Endpoint,
+    server: &Server,
     findings: &mut Findings,
 ) -> Vec<SecurityGroup> {
     if let Some(first) = entries.get(MAX_GROUPS) {
@@ -93,7 +93,7 @@ fn claim(
 fn group(
     entry: &GroupEntry,
     owner: Place,
-    server: &Endpoint,
+    server: &Server,
     findings: &mut Findings,
 ) -> Option<SecurityGroup> {
     let (id, place) = required(&entry.group, "group", "the entry", owner, findings)?;
@@ -150,7 +150,7 @@ fn group(
 fn keys(
     entry: &GroupEntry,
     (mode, owner): (GroupMode, Place),
-    server: &Endpoint,
+    server: &Server,
     findings: &mut Findings,
 ) -> Option<KeySource> {
     let Some(at) = &entry.keys else {
@@ -180,7 +180,7 @@ fn keys(
 fn source(
     keys: &KeysEntry,
     place: Place,
-    server: &Endpoint,
+    server: &Server,
     findings: &mut Findings,
 ) -> Option<KeySource> {
     let count = usize::from(keys.file.is_some())
@@ -224,7 +224,7 @@ fn source(
 fn service(
     entry: &SksEntry,
     place: Place,
-    server: &Endpoint,
+    server: &Server,
     findings: &mut Findings,
 ) -> Option<KeySource> {
     let lifetime = duration(&entry.key_lifetime, findings);
@@ -244,7 +244,7 @@ fn service(
         .collect();
     let own = || {
         KeySource::Own(Served {
-            endpoint: server.clone(),
+            endpoint: server.first_endpoint().clone(),
             lifetime: lifetime.unwrap_or(LIFETIME),
             members: members.clone(),
         })
@@ -259,8 +259,15 @@ fn service(
             .help("use an endpoint such as opc.tcp://sks.local:4840");
         return None;
     };
-    if endpoint == *server {
+    if endpoint == *server.first_endpoint() {
         return Some(own());
+    }
+    if server.redundant_endpoints.contains(&endpoint) {
+        let message = "only the first server of a redundant set creates keys";
+        findings
+            .error(Code::KeyService, at, message)
+            .help("without an endpoint, the keys are those of the first server: sks: {}");
+        return None;
     }
     if entry.key_lifetime.is_some() || entry.members.is_some() {
         findings
@@ -341,11 +348,24 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
             .error(Code::KeyService, at.place, message)
             .help("set server: {security: [Basic256Sha256]}");
     }
-    if matches!(server.endpoint.host.as_str(), "0.0.0.0" | "::") {
+    if !server.redundant.is_empty() && server.redundant_endpoints.is_empty() {
         let message = format!(
-            "programs request the keys of the group `{}` at `server.endpoint`, but other hosts cannot reach {}",
-            short(&group.id),
-            server.endpoint
+            "each server of a redundant set would create its own keys of the group `{}`",
+            short(&group.id)
+        );
+        findings.error(Code::KeyService, at.place, message).help(
+            "set server: {redundant_endpoints: [\"opc.tcp://HOST-1:4840\", \"opc.tcp://HOST-2:4840\"]}: the first \
+             server creates the keys, and the others request them there",
+        );
+    }
+    let (endpoint, key) = match server.redundant_endpoints.first() {
+        Some(first) => (first, "server.redundant_endpoints"),
+        None => (&server.endpoint, "server.endpoint"),
+    };
+    if matches!(endpoint.host.as_str(), "0.0.0.0" | "::") {
+        let message = format!(
+            "programs request the keys of the group `{}` at `{key}`, but other hosts cannot reach {endpoint}",
+            short(&group.id)
         );
         findings.warning(Code::KeyService, at.place, message).help(
             "set server: {endpoint: \"opc.tcp://NAME:4840\"} with the name or address of its host; \

@@ -10,7 +10,7 @@ use crate::call::Call;
 use crate::code::Code;
 use crate::endpoint::Endpoint;
 use crate::findings::Findings;
-use crate::mapping::{SecurityPolicy, Variable};
+use crate::mapping::{SecurityPolicy, Server, Variable};
 use crate::node_id::ExpandedNodeIdText;
 use crate::read::{At, Field, given, short};
 use crate::remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, SkillsPlace, User};
@@ -23,10 +23,10 @@ const MAX_SERVERS: usize = 256;
 
 pub(super) type Servers = Declared<Vec<RemoteServer>>;
 
-/// Checks the servers; `own` is the endpoint of the cell's own server.
+/// Checks the servers; `own` is the cell's own server.
 pub(super) fn check(
     entries: Option<&At<Vec<At<RemoteServerEntry>>>>,
-    (own, namespaces): (&Endpoint, &Namespaces),
+    (own, namespaces): (&Server, &Namespaces),
     findings: &mut Findings,
 ) -> Servers {
     let mut servers = Servers {
@@ -71,7 +71,7 @@ pub(super) fn check(
 fn server(
     entry: &RemoteServerEntry,
     place: Place,
-    (own, namespaces, numbers): (&Endpoint, &Namespaces, &mut HashMap<u16, Place>),
+    (own, namespaces, numbers): (&Server, &Namespaces, &mut HashMap<u16, Place>),
     findings: &mut Findings,
 ) -> Option<(RemoteServer, Place)> {
     const OF: &str = "the server";
@@ -197,10 +197,10 @@ fn name_of(name: &str, place: Place, findings: &mut Findings) -> Option<String> 
     None
 }
 
-/// Reads an endpoint that differs from the endpoint of the cell's own server.
+/// Reads an endpoint that differs from the endpoints of the cell's own server.
 fn other_endpoint(
     (text, place): (&str, Place),
-    own: &Endpoint,
+    own: &Server,
     findings: &mut Findings,
 ) -> Option<Endpoint> {
     let endpoint = remote_endpoint(text, place, findings)?;

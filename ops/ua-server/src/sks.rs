@@ -49,7 +49,8 @@ struct Group {
 struct Members {
     /// The ApplicationUri of the cell's own server.
     server: String,
-    /// The ApplicationUris that the mapping lists; `*` at the end stands for any characters.
+    /// The ApplicationUris of its redundant set, and those that the mapping lists; `*` at the end
+    /// stands for any characters.
     listed: Vec<String>,
 }
 
@@ -71,8 +72,9 @@ impl Sks {
     /// Returns an error if the file with the keys cannot be used.
     pub(crate) fn follow(&self, mapping: &Mapping) -> Result<(), Failure> {
         let unusable = |error: String| Failure::new(FailureKind::Io, error);
-        let wanted: Vec<(&SecurityGroup, &Served)> =
-            mapping.security().iter().filter_map(served).collect();
+        let server = mapping.server();
+        let groups = mapping.security().iter().filter(|_| server.creates_keys());
+        let wanted: Vec<(&SecurityGroup, &Served)> = groups.filter_map(served).collect();
         let mut state = self.state.lock();
         let state = &mut *state;
         let now = now();
@@ -96,9 +98,10 @@ impl Sks {
                 Some(before) => Ring::after(&before.ring, served.lifetime, now),
                 None => Ring::new(served.lifetime, now),
             };
+            let others = server.redundant.iter();
             let members = Members {
-                server: mapping.server().application_uri.clone(),
-                listed: served.members.clone(),
+                server: server.application_uri.clone(),
+                listed: others.chain(&served.members).cloned().collect(),
             };
             let made = Group {
                 policy,
@@ -184,6 +187,11 @@ impl Sks {
             return Err(StatusCode::BadUserAccessDenied);
         }
         state.of(group, wanted).ok_or(StatusCode::BadNotFound)
+    }
+
+    /// Returns whether this server creates the keys of a group.
+    fn creates(&self, group: &str) -> bool {
+        self.state.lock().groups.contains_key(group)
     }
 
     /// Returns the keys of a group for this program itself.
@@ -285,7 +293,7 @@ impl Members {
 }
 
 /// Fetches keys for the server: keys of its own groups from itself, other keys from their key
-/// services.
+/// services. The key service of a redundant set is its first server.
 #[derive(Debug)]
 pub(crate) struct ServerKeys {
     pub(crate) own: Arc<Sks>,
@@ -294,7 +302,7 @@ pub(crate) struct ServerKeys {
 
 impl KeyService for ServerKeys {
     fn fetch<'a>(&'a self, request: &'a KeyRequest) -> Fetching<'a> {
-        if request.own {
+        if request.own && self.own.creates(&request.group) {
             return Box::pin(std::future::ready(self.own.own(&request.group)));
         }
         self.others.fetch(request)

@@ -57,7 +57,7 @@ impl Seen {
             }
         }
         if wished(Part::Opcua) {
-            let url = mapping.server().endpoint.to_string();
+            let url = mapping.server().first_endpoint().to_string();
             let server = look(survey::opcua::check(&url, mapping));
             seen.environment.server = seen.asked(format!("OPC UA server {url}"), server)?;
             seen.methods(mapping)?;
