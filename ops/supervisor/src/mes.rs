@@ -2,6 +2,7 @@
 //! processes, and sources as files.
 
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Duration;
 
 use base64::Engine as _;
@@ -27,14 +28,14 @@ pub(crate) struct Mes(StatusUrl);
 #[derive(Debug)]
 pub(crate) struct Places {
     pub(crate) queries: Semaphore,
-    pub(crate) files: Semaphore,
+    pub(crate) files: Arc<Semaphore>,
 }
 
 impl Default for Places {
     fn default() -> Self {
         Self {
             queries: Semaphore::new(4),
-            files: Semaphore::new(2),
+            files: Arc::new(Semaphore::new(2)),
         }
     }
 }

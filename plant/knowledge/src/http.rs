@@ -203,11 +203,24 @@ impl Site {
         }
     }
 
-    /// Returns an additional page. It may plan a process, which takes long.
+    /// Returns an additional page. All but the status may plan a process, which takes long.
     async fn made_page(&self, path: &str) -> Result<Option<String>, Refusal> {
+        let place = if path == STATUS {
+            None
+        } else {
+            let place = self.queries.place(Lane::Plan).await;
+            Some(place.map_err(|_busy| {
+                let why = "other plans are being made; ask again";
+                Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "busy", why)
+            })?)
+        };
         let (page, path) = (Arc::clone(&self.page), path.to_owned());
-        let made = tokio::task::spawn_blocking(move || page(&path)).await;
-        made.map_err(|error| failed(&error))
+        // A plan is completed after its client has left, and keeps its place.
+        let made = tokio::task::spawn_blocking(move || {
+            let _place = place;
+            page(&path)
+        });
+        made.await.map_err(|error| failed(&error))
     }
 
     async fn sparql(
@@ -582,6 +595,8 @@ pub(crate) fn content(media: &'static str, bytes: Vec<u8>) -> Response<Full<Byte
 }
 
 const JSON: &str = "application/json";
+/// The additional page that is made at once.
+const STATUS: &str = "/status";
 const MAX_CONNECTIONS: usize = 256;
 const MAX_PAIRS: usize = 256;
 const MAX_GRAPHS: usize = 100;

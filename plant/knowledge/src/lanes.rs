@@ -1,6 +1,6 @@
 //! The places of running queries.
 //!
-//! Named questions and updates have places of their own. Any other query starts in a quick place; a
+//! Named questions, updates and plans have places of their own. Any other query starts in a quick place; a
 //! query that holds it for too long moves to a long place, or is stopped if there is none. Each
 //! client has a share of the long places. The text of a long query is remembered, so that its
 //! repetitions do not take quick places.
@@ -23,6 +23,8 @@ pub(crate) enum Lane {
     Named,
     /// An update.
     Write,
+    /// A plan of a process, which is no query.
+    Plan,
     /// Any query of the client with this address.
     Open(IpAddr),
 }
@@ -38,6 +40,7 @@ impl Lane {
 pub(crate) struct Lanes {
     named: Arc<Semaphore>,
     write: Arc<Semaphore>,
+    plan: Arc<Semaphore>,
     quick: Arc<Semaphore>,
     /// Number of queries that wait for a quick place.
     waiting: AtomicUsize,
@@ -80,6 +83,7 @@ impl Lanes {
         Arc::new(Self {
             named: Arc::new(Semaphore::new(long.max(QUICK_PLACES))),
             write: Arc::new(Semaphore::new(WRITE_PLACES)),
+            plan: Arc::new(Semaphore::new(PLAN_PLACES)),
             quick: Arc::new(Semaphore::new(QUICK_PLACES)),
             waiting: AtomicUsize::new(0),
             long,
@@ -111,6 +115,7 @@ impl Lanes {
         let places = match lane {
             Lane::Named => &self.named,
             Lane::Write => &self.write,
+            Lane::Plan => &self.plan,
             Lane::Open(_) => &self.quick,
         };
         let waits = Waits::new(&self.waiting, lane);
@@ -293,6 +298,7 @@ impl Drop for Waits<'_> {
 const QUICK_PLACES: usize = 4;
 /// Updates are made one after the other.
 const WRITE_PLACES: usize = 2;
+const PLAN_PLACES: usize = 2;
 /// Time after which a query needs a long place.
 const QUICK: Duration = Duration::from_millis(250);
 /// The same while other queries wait.

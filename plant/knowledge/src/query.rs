@@ -21,7 +21,7 @@ use tokio::sync::oneshot;
 use tokio::time::Instant;
 
 use crate::bounds;
-use crate::lanes::{Lane, Lanes};
+use crate::lanes::{Lane, Lanes, Seat};
 use crate::question::{Answer, MOST_ROWS, Question};
 use crate::store::{Knowledge, KnowledgeFault};
 use crate::update::{self, Updated};
@@ -211,6 +211,14 @@ impl Queries {
 
     pub(crate) fn knowledge(&self) -> &Arc<Knowledge> {
         &self.knowledge
+    }
+
+    /// Waits for a place of work that is no query.
+    ///
+    /// # Errors
+    /// [`QueryFault::Busy`] if there is none in time.
+    pub(crate) async fn place(&self, lane: Lane) -> Result<Seat, QueryFault> {
+        self.lanes.enter(lane, "", resident()).await
     }
 
     /// Runs a query. Dropping the future stops the query.

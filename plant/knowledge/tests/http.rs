@@ -206,6 +206,43 @@ async fn named_questions_are_answered_beside_many_clients_with_long_queries() {
 }
 
 #[tokio::test]
+async fn a_third_plan_is_told_to_come_again_while_the_status_is_answered() {
+    let (made, wait) = std::sync::mpsc::channel::<()>();
+    let wait = std::sync::Mutex::new(wait);
+    // A plan takes until the test ends it.
+    let page = Arc::new(move |path: &str| {
+        if path != "/status" {
+            wait.lock().unwrap().recv().unwrap();
+        }
+        Some("{}".to_owned())
+    });
+    let knowledge = Arc::new(Knowledge::new().unwrap());
+    let at = "127.0.0.1:0".parse().unwrap();
+    let endpoint = Endpoint::bind(at, knowledge, Limits::default(), page);
+    let endpoint = endpoint.await.unwrap();
+    let at = endpoint.address();
+    let plan = || tokio::spawn(async move { get(at, "/plan/urn:p", "*/*").await.status });
+    let plans = [plan(), plan(), plan()];
+    let refused = async {
+        while !plans.iter().any(tokio::task::JoinHandle::is_finished) {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    let refused = tokio::time::timeout(Duration::from_secs(20), refused).await;
+    assert!(refused.is_ok(), "all wait");
+    assert_eq!(get(at, "/status", "*/*").await.status, 200);
+    for _ in 0..2 {
+        made.send(()).unwrap();
+    }
+    let mut statuses = Vec::new();
+    for plan in plans {
+        statuses.push(plan.await.unwrap());
+    }
+    statuses.sort_unstable();
+    assert_eq!(statuses, [200, 200, 503]);
+}
+
+#[tokio::test]
 async fn queries_come_by_get_by_post_and_as_a_form() {
     let (endpoint, _) = site(Limits::default()).await;
     let at = endpoint.address();

@@ -5,6 +5,7 @@
 //! passes on the password that the user gives for `ua-mes`.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use base64::Engine as _;
@@ -15,6 +16,7 @@ use hyper::header::{CONTENT_LENGTH, HeaderMap};
 use hyper::{Request, Response, StatusCode, Uri};
 use serde::Deserialize;
 use serde_json::{Value, json};
+use tokio::sync::oneshot;
 use tracing::{info, warn};
 
 use super::{RequestBody, bytes, is_loopback_name};
@@ -98,9 +100,10 @@ pub(super) async fn query(page: &Page, query: Query) -> Result<Response<PageBody
     table.map(|table| json_page(&table)).map_err(refusal)
 }
 
-/// Checks a file, and loads it if that is wanted and nothing is wrong with it.
+/// Checks a file, and loads it if that is wanted and nothing is wrong with it. A file whose browser
+/// has left before the load is checked only; each outcome is logged.
 pub(super) async fn upload(
-    page: &Page,
+    page: &Arc<Page>,
     operations: &dyn Operations,
     session: &Session,
     request: Request<impl RequestBody>,
@@ -109,19 +112,32 @@ pub(super) async fn upload(
     require_role(operations, user)?;
     let loads = request.uri().path() == LOAD;
     let by = credentials(request.headers(), user)?;
-    let _place = page.places.files.try_acquire().map_err(|_| busy("files"))?;
+    let place = Arc::clone(&page.places.files).try_acquire_owned();
+    let place = place.map_err(|_| busy("files"))?;
     let file = source_file(request).await?;
     let mes = mes(page).await?;
     if !is_loopback_name(mes.authority()) {
         let why = "ua-mes is not on this host: load the file there with ua-space source add";
         return Err(Refusal::new(StatusCode::CONFLICT, why));
     }
-    if loads {
-        // The browser may leave before the outcome is known.
-        report(user, &file, "load requested");
-    }
-    let done = checked(page, &mes, (&file, by.as_ref()), loads).await;
-    report(user, &file, outcome(&done));
+    let (page, user) = (Arc::clone(page), user.to_owned());
+    let (answer, done) = oneshot::channel();
+    // The task goes on after the browser has left, so that the outcome is known.
+    drop(tokio::spawn(async move {
+        let _place = place;
+        if loads {
+            report(&user, &file, "load requested");
+        }
+        let loads = || loads && !answer.is_closed();
+        let done = checked(&page, &mes, (&file, by.as_ref()), loads).await;
+        report(&user, &file, outcome(&done));
+        // The browser may have left.
+        let _left = answer.send(done);
+    }));
+    let done = done.await.unwrap_or_else(|_| {
+        let why = "the outcome is unknown: the page has failed";
+        Err(Refusal::new(StatusCode::GATEWAY_TIMEOUT, why))
+    });
     done.map(|answer| json_page(&answer))
 }
 
@@ -184,12 +200,12 @@ async fn source_file(request: Request<impl RequestBody>) -> Result<SourceFile, R
     })
 }
 
-/// Checks a file, and loads it if `loads` and it was accepted.
+/// Checks a file, and loads it if it was accepted and `loads` is still true.
 async fn checked(
     page: &Page,
     mes: &Mes,
     (file, by): (&SourceFile, Option<&Credentials>),
-    loads: bool,
+    loads: impl Fn() -> bool,
 ) -> Result<Value, Refusal> {
     if let Some(by) = by {
         let now = page.at().since;
@@ -214,7 +230,7 @@ async fn checked(
         }
         Err(fault) => return Err(refusal(fault)),
     };
-    let loads = loads && answer.get("accepted") == Some(&Value::Bool(true));
+    let loads = answer.get("accepted") == Some(&Value::Bool(true)) && loads();
     if loads {
         mes.load(file, by).await.map_err(unknown_or_refused)?;
     }

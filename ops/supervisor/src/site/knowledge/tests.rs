@@ -71,6 +71,14 @@ struct Cell {
 }
 
 fn cell(answers: &[(u16, &'static str, &'static str)]) -> Cell {
+    cell_with(answers, || ())
+}
+
+/// Creates a cell whose MES calls `before` with each request, before it answers.
+fn cell_with(
+    answers: &[(u16, &'static str, &'static str)],
+    before: impl Fn() + Send + 'static,
+) -> Cell {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("http://{}", listener.local_addr().unwrap());
     let answers = answers.to_vec();
@@ -87,6 +95,7 @@ fn cell(answers: &[(u16, &'static str, &'static str)]) -> Cell {
             let length = length.and_then(|rest| rest.lines().next()?.parse().ok());
             let mut sent = vec![0; length.unwrap_or_default()];
             reader.read_exact(&mut sent).unwrap();
+            before();
             let answer = format!(
                 "HTTP/1.1 {status} x\r\ncontent-type: {media}\r\ncontent-length: {}\r\n\r\n{body}",
                 body.len()
@@ -310,6 +319,34 @@ async fn a_file_is_loaded_after_it_was_accepted() {
         ]
     );
     assert!(received.iter().all(|(_, body)| body == "<CAEXFile/>"));
+}
+
+#[tokio::test]
+async fn a_file_whose_browser_has_left_is_checked_and_not_loaded() {
+    let accepted = (200, JSON, r#"{"accepted":true,"findings":[]}"#);
+    let (seen, mut requests) = tokio::sync::mpsc::channel(1);
+    let (answers, wait) = std::sync::mpsc::channel::<()>();
+    let before = move || {
+        seen.blocking_send(()).unwrap();
+        wait.recv().unwrap();
+    };
+    let Cell { page, .. } = cell_with(&[accepted, (201, "", "")], before);
+    page.operate(Arc::new(Users));
+    let browser = tokio::spawn({
+        let page = Arc::clone(&page);
+        let by = ("engineer", "/knowledge/load?name=a.ttl");
+        async move { send_file(&page, by, &[], "<urn:a> <urn:p> 1 .").await }
+    });
+    requests.recv().await.unwrap();
+    browser.abort();
+    assert!(browser.await.unwrap_err().is_cancelled());
+    assert_eq!(page.places.files.available_permits(), 1, "the check ended");
+    answers.send(()).unwrap();
+    // The place is free when the outcome has been logged.
+    let all = page.places.files.acquire_many(2);
+    let all = tokio::time::timeout(Duration::from_secs(20), all).await;
+    assert!(all.unwrap().is_ok());
+    assert!(requests.try_recv().is_err(), "the file was loaded");
 }
 
 #[tokio::test]
