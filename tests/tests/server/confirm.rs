@@ -85,6 +85,56 @@ fn confirms(cell: &Cell, mut robot: Child) {
 }
 
 #[test]
+fn without_confirmations_a_write_is_good_when_its_value_has_left_and_not_when_it_was_replaced() {
+    const RARE: &str = "
+namespaces:
+  2: urn:ua-bridge:system-tests
+spaces:
+  - id: 2
+variables:
+  - {node: ns=2;i=30, name: setpoint, type: Double, origin: 0, at_most: 0.125 Hz}
+server:
+  security: [None]
+";
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = serving(&cell, RARE);
+    let group = UadpSocket::join();
+    let start = |value| {
+        let arguments = [
+            SERVER_ENDPOINT,
+            SETPOINT,
+            "Double",
+            value,
+            "--patience",
+            "20",
+        ];
+        cell.asyncua_started("opcua_write.py", &arguments).start()
+    };
+    let status = |mut writer: Child| {
+        writer.wait_for_json("the status of a write", SOON, |line| {
+            line.get("status").cloned()
+        })
+    };
+    assert_eq!(status(start("1.0")), "Good");
+    // Eight seconds begin, in which values wait.
+    let replaced = start("2.0");
+    eventually("the value is shown", SOON, || {
+        (read(&cell, SETPOINT)["value"] == 2.0).then_some(())
+    });
+    let newest = start("3.0");
+    assert_eq!(status(replaced), "BadRequestCancelledByRequest");
+    assert_eq!(status(newest), "Good");
+    let sent = group.receive_for(Duration::from_millis(100));
+    let sent = sent.iter().filter_map(|datagram| written(datagram));
+    let mut values: Vec<f64> = sent.flat_map(|(_, values)| values).collect();
+    // Values are repeated for late joiners.
+    values.dedup();
+    assert_eq!(values, [1.0, 3.0]);
+}
+
+#[test]
 fn a_write_has_succeeded_when_a_robot_of_rospy_answers_and_has_not_happened_when_it_does_not() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::Ros1]) else {
         return;
