@@ -16,7 +16,6 @@ use super::{permissions, required};
 use crate::call::{Call, CallBinding, CallKind, ExecutedBy, MethodTarget};
 use crate::code::Code;
 use crate::document::{AcknowledgesEntry, CallEntry};
-use crate::endpoint::Endpoint;
 use crate::findings::Findings;
 use crate::mapping::{Server, Variable};
 use crate::node_id::NodeIdText;
