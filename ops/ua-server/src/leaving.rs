@@ -19,16 +19,20 @@ use tokio::time::timeout;
 
 /// The result of sending a value, for the client that wrote it.
 #[derive(Debug)]
-pub(crate) struct Departure(oneshot::Sender<StatusCode>);
+pub(crate) struct Departure {
+    /// The written field of the topic, or `None` for all fields.
+    field: Option<usize>,
+    result: oneshot::Sender<StatusCode>,
+}
 
 /// The result of sending a value that is still to come.
 #[derive(Debug)]
 pub(crate) struct Departing(oneshot::Receiver<StatusCode>);
 
-/// Creates the two ends of a result.
-pub(crate) fn departure() -> (Departure, Departing) {
+/// Creates the two ends of a result, for a write of a field or of all fields.
+pub(crate) fn departure(field: Option<usize>) -> (Departure, Departing) {
     let (result, pending) = oneshot::channel();
-    (Departure(result), Departing(pending))
+    (Departure { field, result }, Departing(pending))
 }
 
 impl Departure {
@@ -39,7 +43,7 @@ impl Departure {
 
     fn answer(self, status: StatusCode) {
         // The client may be lost.
-        let _gone = self.0.send(status);
+        let _gone = self.result.send(status);
     }
 }
 
@@ -117,15 +121,16 @@ impl TopicWrites {
 
     /// Adds a value of a newer write. The Router has one held value at most, and has dropped the
     /// oldest values if its queue was full.
-    fn add(&mut self, departures: Vec<Departure>, unsent: Unsent) {
-        answer(self.held.take(), REPLACED);
+    fn add(&mut self, mut departures: Vec<Departure>, unsent: Unsent) {
+        replace(self.held.take(), Some(&mut departures));
         if unsent.is_held {
             self.held = Some(departures);
         } else {
             self.queued.push_back(departures);
         }
         while self.queued.len() > unsent.queued {
-            answer(self.queued.pop_front(), REPLACED);
+            let dropped = self.queued.pop_front();
+            replace(dropped, self.queued.front_mut());
         }
     }
 
@@ -240,6 +245,19 @@ impl Leaving {
     }
 }
 
+/// Answers the writes of a value that was dropped for a newer one. Writes of other fields wait for
+/// the newer value, which contains theirs.
+fn replace(dropped: Option<Vec<Departure>>, mut newer: Option<&mut Vec<Departure>>) {
+    let field = newer.as_ref().and_then(|newer| newer.first()?.field);
+    for departure in dropped.into_iter().flatten() {
+        let is_other = field.is_some() && departure.field.is_some() && departure.field != field;
+        match &mut newer {
+            Some(newer) if is_other => newer.push(departure),
+            _ => departure.answer(REPLACED),
+        }
+    }
+}
+
 /// Answers the writes of a value.
 fn answer(departures: Option<Vec<Departure>>, status: StatusCode) {
     for departure in departures.into_iter().flatten() {
@@ -289,7 +307,16 @@ mod tests {
 
         /// Reports a value. Afterwards, the Router has these unsent values.
         fn write(&mut self, verdict: Verdict, queued: usize, is_held: bool) -> Departing {
-            let (departure, departing) = departure();
+            self.write_field(None, verdict, (queued, is_held))
+        }
+
+        fn write_field(
+            &mut self,
+            field: Option<usize>,
+            verdict: Verdict,
+            (queued, is_held): (usize, bool),
+        ) -> Departing {
+            let (departure, departing) = departure(field);
             self.leaving.add(departure);
             self.unsent = Unsent { queued, is_held };
             self.leaving.handled(Self::topic(30), verdict, self.unsent);
@@ -375,6 +402,21 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_value_that_replaces_another_contains_the_other_fields_that_were_written() {
+        let overflow = Verdict::ForwardAfterDroppingOldest;
+        for (verdict, waits) in [(Verdict::Forward, (0, true)), (overflow, (1, false))] {
+            let mut writes = Writes::default();
+            let mut write = |field| writes.write_field(field, verdict, waits);
+            let [first, second, again] = [write(Some(0)), write(Some(1)), write(Some(0))];
+            assert_eq!(first.left().await, Err(REPLACED));
+            writes.unsent.is_held = false;
+            writes.leave(Ok(()), 0);
+            assert_eq!(second.left().await, Ok(()));
+            assert_eq!(again.left().await, Ok(()));
+        }
+    }
+
+    #[tokio::test]
     async fn a_write_that_was_not_sent_has_a_bad_status() {
         for (reason, status) in [
             (Reason::Takeover, StatusCode::BadInvalidState),
@@ -397,7 +439,7 @@ mod tests {
         let muted = writes.write(Verdict::Forward, 0, true);
         writes.drain(true);
         assert_eq!(muted.left().await, Err(StatusCode::BadInvalidState));
-        let (departure, departing) = departure();
+        let (departure, departing) = departure(None);
         departure.refuse();
         assert_eq!(departing.left().await, Err(StatusCode::BadInvalidState));
     }
@@ -414,7 +456,7 @@ mod tests {
 
     #[tokio::test]
     async fn an_answer_after_the_end_of_polling_is_received() {
-        let (departure, departing) = departure();
+        let (departure, departing) = departure(None);
         let late = async {
             let until = bridge_node::now().monotonic + 2 * POLLING;
             while bridge_node::now().monotonic < until {

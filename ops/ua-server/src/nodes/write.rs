@@ -230,7 +230,7 @@ impl WritePath {
     fn send_alone(
         &self,
         writer: &Writer,
-        (topic, field): (&TopicNode, Option<usize>),
+        (topic, at): (&TopicNode, Option<usize>),
         write: &ParsedWriteValue,
         (register, awaited): Registration<'_>,
     ) -> Result<(Shown, OnItsWay), StatusCode> {
@@ -252,7 +252,7 @@ impl WritePath {
             .as_ref()
             .ok_or(StatusCode::BadTypeMismatch)?;
         let shown = self.live.shown(topic.topic);
-        let field = field.and_then(|field| topic.fields.get(field));
+        let field = at.and_then(|field| topic.fields.get(field));
         let fields = new_fields(&shown, topic, field, (value, &write.index_range))?;
         if !properties::are_within(topic, &fields) {
             return Err(StatusCode::BadOutOfRange);
@@ -262,7 +262,7 @@ impl WritePath {
         drop(fields);
         let source = source_of(&write.value);
         let value = (block.clone(), source);
-        let on_its_way = self.send(topic, value, ((writer.commander)(), awaited))?;
+        let on_its_way = self.send((topic, at), value, ((writer.commander)(), awaited))?;
         let stamp = Stamp {
             status: StatusCode::Good,
             source: Some(source),
@@ -275,7 +275,7 @@ impl WritePath {
     /// Passes a written value to the run loop.
     fn send(
         &self,
-        topic: &TopicNode,
+        (topic, field): (&TopicNode, Option<usize>),
         (block, source): (Bytes, Timestamp),
         (commander, awaited): (Commander, Option<Awaited>),
     ) -> Result<OnItsWay, StatusCode> {
@@ -286,7 +286,7 @@ impl WritePath {
         let size = u32::try_from(block.len() >> 10).map_err(|_| full)?;
         let room = Arc::clone(&self.room);
         let room = room.try_acquire_many_owned(size).map_err(|_| full)?;
-        let (departure, departing) = departure();
+        let (departure, departing) = departure(field);
         let (answer, answered) = oneshot::channel();
         let write = ClientWrite {
             topic: topic.topic,
