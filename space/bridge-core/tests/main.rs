@@ -23,6 +23,7 @@ mod call_actions;
 mod call_freedom;
 mod call_safety;
 mod calls;
+mod claims;
 mod confirm;
 mod deadline;
 mod events;

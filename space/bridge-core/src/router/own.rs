@@ -6,6 +6,7 @@ use std::net::SocketAddr;
 use mappings::TopicId;
 
 use super::announcements::Asked;
+use super::claims::FreeNamespace;
 use super::{About, Router, Values};
 use crate::counters::Reason;
 use crate::loop_rule::{Owned, Side, What, may_cross};
@@ -41,27 +42,41 @@ impl Router {
 
     /// Probes for other writers of the own namespaces, and waits for a moment before anything is
     /// sent in them. If another program writes a namespace, nothing is sent in it until that
-    /// program has been silent for `receive_timeout`. Has no effect for a program that does not
-    /// share its space.
+    /// program has been silent for `receive_timeout`. The probes are repeated, and a writer that is
+    /// received in the first seconds only is found too: probes may be lost, and a program that
+    /// starts at the same moment does not respond. Has no effect for a program that does not share
+    /// its space.
     pub fn claim(&mut self, now: Now) {
         let Owned::Only(namespaces) = &self.values.owned else {
             return;
         };
-        let namespaces: Vec<u16> = namespaces.iter().copied().collect();
+        let [a, b, c, d, ..] = self.instance;
+        let claims = &mut self.values.claims;
+        claims.set_random(u32::from_le_bytes([a, b, c, d]));
+        claims.claim_by_probes(namespaces.iter().copied(), now.monotonic);
+        self.probe_claims(now);
+    }
+
+    /// Sends the due probes for other writers of claimed namespaces.
+    fn probe_claims(&mut self, now: Now) {
         let own = self.values.settings.own;
-        for namespace in &namespaces {
+        for namespace in self.values.claims.take_probes(now.monotonic) {
             // The programs of other namespaces do not respond: there may be hundreds of them.
-            let asked = Asked::namespace(own, *namespace);
+            let asked = Asked::namespace(own, namespace);
             self.values.send_probe(&asked.probe(), Some(own));
         }
-        self.values.claims.claim(namespaces, now.monotonic);
     }
 
     /// Starts to send in free namespaces.
     pub(super) fn look_at_claims(&mut self, now: Now) {
+        self.probe_claims(now);
         let (_, _, silence) = self.values.periods();
-        for (namespace, again) in self.values.claims.poll(silence, now.monotonic) {
-            if again {
+        for free in self.values.claims.poll(silence, now.monotonic) {
+            let FreeNamespace {
+                namespace,
+                was_taken,
+            } = free;
+            if was_taken {
                 let by = None;
                 let name = String::new();
                 self.values.tell(Output::Taken {
@@ -70,7 +85,7 @@ impl Router {
                     name,
                 });
             }
-            self.send_again(namespace, again, now);
+            self.send_again(namespace, was_taken, now);
         }
     }
 
