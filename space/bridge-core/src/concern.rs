@@ -29,6 +29,11 @@ impl Concern {
         self.has(topic.space, topic.triple().1)
     }
 
+    /// Returns whether the program uses the given namespaces only.
+    pub(crate) const fn is_limited(&self) -> bool {
+        matches!(self, Self::Only(_))
+    }
+
     /// Limits the program to no namespaces, unless it is limited already.
     pub(crate) fn limit(&mut self) {
         if matches!(self, Self::All) {

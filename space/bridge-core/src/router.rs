@@ -114,7 +114,7 @@ use crate::tap::{Crossing, Tapped};
 ///   [`applications`](Self::applications).
 /// - the Router: [`mapping`](Self::mapping), [`others`](Self::others), [`hops`](Self::hops),
 ///   [`groups`](Self::groups), [`redundancy`](Self::redundancy), [`is_standby`](Self::is_standby),
-///   [`muted_samples`](Self::muted_samples).
+///   [`muted_samples`](Self::muted_samples), [`interest`](Self::interest).
 #[derive(Debug)]
 pub struct Router {
     /// Topics with their queues, turns and timers, and outputs about them.

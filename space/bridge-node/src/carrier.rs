@@ -1,5 +1,6 @@
 //! The carrier of a program, from its command line and mapping.
 
+mod drops;
 mod routes;
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -21,6 +22,7 @@ use transport::{
 use crate::arguments::Arguments;
 use crate::exit::{Failure, FailureKind};
 use crate::mapping_file::Running;
+pub(crate) use drops::rules;
 use routes::LiveRoutes;
 
 /// The source of own messages for a carrier that does not return them. No sender has this address.

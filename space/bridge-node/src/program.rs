@@ -379,6 +379,7 @@ async fn prepare<P: Program>(
         held: port.addresses().and_then(Held::start),
         port,
         carrier,
+        interest: None,
         outbox: Outbox::default(),
         owned: P::owned,
         claims: P::CLAIMS,

@@ -17,7 +17,7 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Handover, Heard, Notice, Output, Owned, Reason, Router};
+use bridge_core::{Handover, Heard, Interest, Notice, Output, Owned, Reason, Router};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::watch;
@@ -56,6 +56,8 @@ pub(crate) struct Shell<P> {
     pub(crate) router: Router,
     pub(crate) port: P,
     pub(crate) carrier: Box<dyn Carrier>,
+    /// The messages that the carrier does not drop; `None` for all of them.
+    pub(crate) interest: Option<Interest>,
     /// The datagrams to send together.
     pub(crate) outbox: Outbox,
     /// The network interfaces that the port cannot change while it runs.
@@ -184,6 +186,7 @@ impl<P: Port> Shell<P> {
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
             more |= self.drain();
+            self.follow_interest();
             if more {
                 // The other tasks of the thread pass on the values of this turn first: the event
                 // loop of DDS, or another program. The budget of a task counts polls, and a poll

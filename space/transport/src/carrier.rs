@@ -8,6 +8,7 @@ use std::net::SocketAddr;
 use std::task::{Context, Poll};
 use std::time::{Duration, SystemTime};
 
+use crate::key_rule::KeyRule;
 use crate::udp::{SendError, Udp};
 use crate::watch::Change;
 
@@ -105,6 +106,12 @@ pub trait Carrier: fmt::Debug + Send {
     /// Returns the number of messages that the carrier dropped, by reason.
     fn dropped(&self) -> Vec<(&'static str, u64)> {
         Vec::new()
+    }
+
+    /// Lets the network drop messages by rules before they reach the program. It only saves work:
+    /// a carrier that cannot do so delivers them. Replaces earlier rules.
+    fn drop_by(&mut self, rules: Vec<KeyRule>) {
+        drop(rules);
     }
 
     /// Returns the number of messages since the last call that the program did not receive in time,
@@ -308,6 +315,10 @@ impl Carrier for Udp {
 
     fn capacity(&self) -> Capacity {
         Self::capacity(self)
+    }
+
+    fn drop_by(&mut self, rules: Vec<KeyRule>) {
+        Self::drop_by(self, rules);
     }
 }
 

@@ -1,10 +1,11 @@
-//! The kernel's filter for datagrams of this process.
+//! The kernel's filter for datagrams of this process, and for those that the program does not use.
 //!
 //! The kernel delivers each multicast datagram to all members of the group, including its sender.
 //! A filter of classic BPF on the receiving socket drops own datagrams, and those of the other
-//! programs of the process, before they wake the program. It only saves work: the caller's loop
-//! rule does not depend on it, and applies to everything that the filter does not match, such as a
-//! forged datagram from another address.
+//! programs of the process, before they wake the program. It applies the [`KeyRule`]s too, so that
+//! a program of a group with hundreds of others does not wake for each of their datagrams. It only
+//! saves work: the caller's rules do not depend on it, and apply to everything that the filter does
+//! not match, such as a forged datagram from another address.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -14,15 +15,24 @@ use tokio::net::UdpSocket;
 use tracing::debug;
 
 use crate::interface::Interface;
+use crate::key_rule::{ACCEPT, DROP, JUMP, JUMP_IF_EQUAL, KeyRule, LOAD_HALF, RETURN};
 
 /// The filter of a receiving socket for the datagrams of the sending sockets of the process.
 #[derive(Debug, Default)]
 pub(crate) struct OwnFilter {
-    set: Option<Vec<OwnSource>>,
+    set: Option<Attached>,
     /// The sources of the other programs of the process.
     companions: Vec<OwnSource>,
+    rules: Vec<KeyRule>,
     /// True if the kernel has refused a filter, which is logged once.
     refused: bool,
+}
+
+/// The content of a filter.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Attached {
+    sources: Vec<OwnSource>,
+    rules: Vec<KeyRule>,
 }
 
 /// The source addresses of the datagrams of a sending socket. A sender that is bound to no address
@@ -55,7 +65,17 @@ impl OwnFilter {
         self.update(receiver, senders, present);
     }
 
-    /// Sets the filter again if the senders or the addresses of this host have changed.
+    /// Sets the rules for other datagrams, which the next [`update`](Self::update) applies.
+    pub(crate) fn set_rules(&mut self, rules: Vec<KeyRule>) {
+        let wanted: usize = rules.iter().map(|rule| rule.wanted.len()).sum();
+        // The kernel bounds the size of a filter.
+        self.rules = match wanted <= MOST_WANTED {
+            true => rules,
+            false => Vec::new(),
+        };
+    }
+
+    /// Sets the filter again if the senders, the rules or the addresses of this host have changed.
     pub(crate) fn update(
         &mut self,
         receiver: &UdpSocket,
@@ -66,11 +86,15 @@ impl OwnFilter {
         self.companions = senders.companions.iter().map(source).collect();
         let mut sources = vec![source(&senders.own)];
         sources.extend_from_slice(&self.companions);
-        if self.refused || self.set.as_ref() == Some(&sources) {
+        let wanted = Attached {
+            sources,
+            rules: self.rules.clone(),
+        };
+        if self.refused || self.set.as_ref() == Some(&wanted) {
             return;
         }
-        match attach(&sources, receiver) {
-            Ok(()) => self.set = Some(sources),
+        match attach(&wanted, receiver) {
+            Ok(()) => self.set = Some(wanted),
             Err(error) => {
                 self.refused = true;
                 // A previous filter could drop datagrams of another program that gets an old port.
@@ -134,17 +158,19 @@ impl OwnSource {
     }
 }
 
-/// Returns the filter that drops the datagrams of all sources.
-fn program(sources: &[OwnSource]) -> Option<Vec<SockFilter>> {
+/// Returns the filter that drops the datagrams of all sources, and those that rules drop.
+fn program(sources: &[OwnSource], rules: &[KeyRule]) -> Option<Vec<SockFilter>> {
     let parts: Option<Vec<Vec<SockFilter>>> = sources.iter().map(OwnSource::program).collect();
     let mut program: Vec<SockFilter> = parts?.into_iter().flatten().collect();
+    program.extend(rules.iter().flat_map(KeyRule::program));
     program.push(SockFilter::new(RETURN, 0, 0, ACCEPT));
     Some(program)
 }
 
 /// Attaches the filter, which replaces the previous filter of the socket.
-fn attach(sources: &[OwnSource], receiver: &UdpSocket) -> io::Result<()> {
-    let program = program(sources).ok_or_else(|| {
+fn attach(wanted: &Attached, receiver: &UdpSocket) -> io::Result<()> {
+    let Attached { sources, rules } = wanted;
+    let program = program(sources, rules).ok_or_else(|| {
         let many = sources.iter().map(|source| source.addresses.len()).max();
         io::Error::other(format!(
             "this host has {} addresses",
@@ -154,19 +180,14 @@ fn attach(sources: &[OwnSource], receiver: &UdpSocket) -> io::Result<()> {
     SockRef::from(receiver).attach_filter(&program)
 }
 
-// Instructions of classic BPF, see `Documentation/networking/filter.rst` of Linux.
-const LOAD_HALF: u16 = 0x28;
+/// The largest number of wanted keys in a filter: with its other parts, half of the instructions
+/// that the kernel accepts.
+const MOST_WANTED: usize = 512;
 const LOAD_WORD: u16 = 0x20;
-const JUMP_IF_EQUAL: u16 = 0x15;
-const JUMP: u16 = 0x05;
-const RETURN: u16 = 0x06;
 /// The filter of a UDP socket sees a datagram from its UDP header on.
 const SOURCE_PORT: u32 = 0;
 /// Offset 12 of the IPv4 header, relative to `SKF_NET_OFF`.
 const SOURCE_ADDRESS: u32 = 0xFFF0_0000 + 12;
-/// The maximum number of bytes to accept.
-const ACCEPT: u32 = u32::MAX;
-const DROP: u32 = 0;
 
 #[cfg(test)]
 mod tests {
@@ -196,7 +217,7 @@ mod tests {
         let first = std::net::UdpSocket::bind(("127.0.0.2", 0)).unwrap();
         let port = first.local_addr().unwrap().port();
         let own = sender(SocketAddr::from(([127, 0, 0, 2], port)));
-        let program = program(&[OwnSource::of(own, present)]).unwrap();
+        let program = program(&[OwnSource::of(own, present)], &[]).unwrap();
         SockRef::from(&receiver).attach_filter(&program).unwrap();
         for host in hosts {
             let address = (Ipv4Addr::new(127, 0, 0, *host), port);
@@ -242,7 +263,7 @@ mod tests {
         let unbound = |own: SocketAddr| SocketAddr::from((Ipv4Addr::UNSPECIFIED, own.port()));
         assert_eq!(received(unbound, &many(252), &[2, 251, 252]), [252]);
         let source = OwnSource::of(SocketAddr::from(([0, 0, 0, 0], 1)), &many(253));
-        assert!(program(&[source]).is_none());
+        assert!(program(&[source], &[]).is_none());
     }
 
     #[test]
@@ -261,7 +282,7 @@ mod tests {
         };
         let mut filter = OwnFilter::default();
         filter.set(&receiver, alone(sender), std::slice::from_ref(&one));
-        let set = |filter: &OwnFilter| filter.set.as_ref().unwrap()[0].addresses.clone();
+        let set = |filter: &OwnFilter| filter.set.as_ref().unwrap().sources[0].addresses.clone();
         assert_eq!(set(&filter), [one.address]);
         filter.update(&receiver, alone(sender), &[one.clone(), two.clone()]);
         assert_eq!(set(&filter), [one.address, two.address]);
@@ -284,7 +305,7 @@ mod tests {
             .iter()
             .map(|all| OwnSource::of(*all, &[]))
             .collect();
-        let program = program(&sources).unwrap();
+        let program = program(&sources, &[]).unwrap();
         SockRef::from(&receiver).attach_filter(&program).unwrap();
         for (number, sender) in (0_u8..).zip(&senders) {
             sender.send_to(&[number], to).unwrap();

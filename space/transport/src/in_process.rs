@@ -16,6 +16,7 @@ use std::time::Duration;
 
 use crate::carrier::{Capacity, Carrier, CarrierChange, Outgoing, Received, Senders};
 use crate::ethernet::{Ethernet, EthernetOptions};
+use crate::key_rule::KeyRule;
 use crate::udp::{Options, SendError, Udp};
 
 /// The carriers of one process that exchange messages without the network.
@@ -339,6 +340,10 @@ impl<N: HubNetwork> Carrier for InProcess<N> {
 
     fn dropped(&self) -> Vec<(&'static str, u64)> {
         self.network.dropped()
+    }
+
+    fn drop_by(&mut self, rules: Vec<KeyRule>) {
+        self.network.drop_by(rules);
     }
 
     fn overflowed(&mut self) -> u64 {

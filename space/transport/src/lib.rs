@@ -13,6 +13,7 @@ mod ethernet;
 mod filter;
 mod in_process;
 mod interface;
+mod key_rule;
 mod udp;
 mod watch;
 
@@ -24,5 +25,6 @@ pub use carriers::{CarrierRules, Carriers, ForwardTo, Judgement, MessagePath};
 pub use ethernet::{Ethernet, EthernetError, EthernetOptions, VlanTag};
 pub use in_process::ProcessHub;
 pub use interface::{Interface, InterfaceError, interfaces};
+pub use key_rule::{ByteTest, KeyRule};
 pub use udp::{OpenError, Options, SendError, Udp};
 pub use watch::{Change, Finding, Held, LOOK};

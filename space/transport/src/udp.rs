@@ -18,6 +18,7 @@ use crate::batch::{self, Batch};
 use crate::carrier::{Capacity, Outgoing, Received};
 use crate::filter::{OwnFilter, ProcessSenders};
 use crate::interface::{Interface, InterfaceError, interfaces};
+use crate::key_rule::KeyRule;
 use crate::watch::{Change, Wanted, Watch};
 
 /// A UDP socket that receives and sends the datagrams of a PubSub connection.
@@ -241,6 +242,19 @@ impl Udp {
     /// datagrams. Without `own` datagrams only.
     pub(crate) fn drop_companions(&mut self, companions: Vec<SocketAddr>) {
         self.companions = companions;
+        self.update_filter();
+    }
+
+    /// Lets the kernel drop datagrams by rules, if it can. Replaces earlier rules. Without `own`
+    /// datagrams only.
+    pub fn drop_by(&mut self, rules: Vec<KeyRule>) {
+        if let Some(filter) = &mut self.own_filter {
+            filter.set_rules(rules);
+        }
+        self.update_filter();
+    }
+
+    fn update_filter(&mut self) {
         if let Some(filter) = &mut self.own_filter {
             let senders = ProcessSenders {
                 own: self.local,

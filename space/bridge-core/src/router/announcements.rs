@@ -125,7 +125,6 @@ impl Announcements {
     pub(super) fn introduce(&mut self, own: Application, now: Now) {
         self.applications.introduce(own);
         self.plan_application(now);
-        self.probe_applications(now);
     }
 
     /// Returns the applications of other programs with the space and the address of each.

@@ -20,10 +20,14 @@ use crate::settings::{Local, Now};
 
 impl Router {
     /// Sets the description of this program. It is announced once, and in response to probes for
-    /// applications or for its Endpoints. The other applications are probed once. A program without
-    /// values is discovered by this description.
+    /// applications or for its Endpoints. The other applications are probed once, unless this
+    /// program is [limited](Self::limit_to): in a group of hundreds, all of them would respond to
+    /// each new one. A program without values is discovered by this description.
     pub fn introduce(&mut self, own: Application, now: Now) {
         self.announcements.introduce(own, now);
+        if !self.values.concern.is_limited() {
+            self.announcements.probe_applications(now);
+        }
     }
 
     /// Returns the known other applications of the group with the space and the address of each.
@@ -225,6 +229,8 @@ impl Router {
             Announced::ActionMetaData(action) => {
                 self.call_traffic().learn_call(action, (space, from), now);
             }
+            // A limited program does not use the descriptions of others.
+            Announced::ApplicationDescription { .. } if self.values.concern.is_limited() => {}
             Announced::ApplicationDescription {
                 description,
                 capabilities,

@@ -1,14 +1,16 @@
 //! The namespaces of the space that only this program writes, and the handling of other programs
 //! that write them.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 
-use mappings::TopicId;
+use mappings::{SpaceId, TopicId};
 
 use super::announcements::Asked;
 use super::claims::FreeNamespace;
 use super::{About, Router, Values};
 use crate::counters::Reason;
+use crate::interest::Interest;
 use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::output::Output;
 use crate::settings::Now;
@@ -55,6 +57,37 @@ impl Router {
         claims.set_random(u32::from_le_bytes([a, b, c, d]));
         claims.claim_by_probes(namespaces.iter().copied(), now.monotonic);
         self.probe_claims(now);
+    }
+
+    /// Returns the messages of other programs that this program handles; `None` for all of them.
+    /// It changes with each input.
+    #[must_use]
+    pub fn interest(&self) -> Option<Interest> {
+        let Values {
+            concern,
+            owned: Owned::Only(owned),
+            redundant: None,
+            part: None,
+            ..
+        } = &self.values
+        else {
+            return None;
+        };
+        let used = concern.namespaces()?;
+        if self.values.tap.is_on() {
+            return None;
+        }
+        let own = self.values.settings.own;
+        let namespaces = owned.iter().map(|namespace| (own, *namespace));
+        let mut announced: BTreeSet<SpaceId> = used.iter().map(|(space, _)| *space).collect();
+        if !self.values.claims.is_empty() {
+            // The announcements of another writer show that a claimed namespace is taken.
+            announced.insert(own);
+        }
+        Some(Interest {
+            namespaces: used.iter().copied().chain(namespaces).collect(),
+            announced,
+        })
     }
 
     /// Sends the due probes for other writers of claimed namespaces.

@@ -5,7 +5,7 @@ use tracing::{info, warn};
 use transport::{Arrival, Carrier, CarrierChange, Senders};
 
 use super::Shell;
-use crate::carrier::{limit, link, relay};
+use crate::carrier::{limit, link, relay, rules};
 use crate::clock::now;
 use crate::port::Port;
 
@@ -34,6 +34,20 @@ impl<P: Port> Shell<P> {
         self.router.set_relay(relay(self.carrier.as_ref()));
         self.router.set_limit(limit(self.carrier.as_ref()));
         self.router.set_link(link(self.carrier.as_ref()));
+    }
+
+    /// Lets the network drop the messages that the Router does not handle.
+    pub(super) fn follow_interest(&mut self) {
+        // An observer sees all messages.
+        let interest = match self.observer {
+            None => self.router.interest(),
+            Some(_) => None,
+        };
+        if interest != self.interest {
+            let rules = interest.as_ref().map(rules).unwrap_or_default();
+            self.carrier.drop_by(rules);
+            self.interest = interest;
+        }
     }
 
     fn group_is_back(&mut self, interface: &str) {
