@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
 use std::num::NonZeroU16;
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use log_limit::LogLimit;
@@ -324,11 +325,19 @@ impl Mdns {
         }
     }
 
+    /// Plans an announcement for a new or changed server, which is not one for each of many servers
+    /// that appear together.
+    fn announce_soon(&mut self) {
+        let settled = Instant::now() + shared(SETTLE..=SETTLE_LATE, self.there.len());
+        self.announce_at = self.announce_at.min(settled);
+    }
+
     /// Repeats the announcements. A late starter that sends its query from another port than that
     /// of mDNS gets the response at that port. Some programs do not listen there, and need
     /// announcements without a query.
     fn announce_again(&mut self) {
-        self.announce_at = Instant::now() + ANNOUNCE_EVERY;
+        self.announce_at =
+            Instant::now() + shared(ANNOUNCE_EVERY..=ANNOUNCE_SELDOM, self.there.len());
         self.follow_renames();
         if self.goodbyes.is_none() {
             self.goodbyes = hear_goodbyes(&self.interface);
@@ -397,7 +406,7 @@ impl Mdns {
                 if !is_known && self.there.len() < MOST {
                     // At once, but not for each of many that appear together: a record is sent at
                     // most once a second.
-                    self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
+                    self.announce_soon();
                 }
                 let is_as_before = outdated.is_some_and(|(before, beside, _)| {
                     (before, beside) == (announcement.clone(), aside)
@@ -643,6 +652,15 @@ fn instance(fullname: &str) -> Option<String> {
     (label(&name) == name).then_some(name)
 }
 
+/// Returns a time in the range that grows with the number of servers: each of them receives the
+/// announcements of all others.
+fn shared(range: RangeInclusive<Duration>, servers: usize) -> Duration {
+    let (least, most) = range.into_inner();
+    let servers = u32::try_from(servers).unwrap_or(u32::MAX);
+    let wanted = least.saturating_mul(servers) / SERVERS_AT_FULL_RATE;
+    wanted.clamp(least, most)
+}
+
 /// The service of OPC UA servers over TCP (OPC 10000-12, Annex C).
 pub const SERVICE: &str = "_opcua-tcp._tcp.local.";
 /// The key of the TXT record with the start time, which distinguishes the runs of a program. Only
@@ -651,7 +669,12 @@ const START: &str = "start";
 /// The key of the TXT record with the number in the space. Only programs of this project use it.
 const NUMBER: &str = "ns";
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);
+/// Half of the time for which records of addresses are valid (RFC 6762, 10).
+const ANNOUNCE_SELDOM: Duration = Duration::from_secs(60);
 const SETTLE: Duration = Duration::from_millis(200);
+const SETTLE_LATE: Duration = Duration::from_secs(5);
+/// The number of servers above which announcements become less frequent.
+const SERVERS_AT_FULL_RATE: u32 = 8;
 /// Exceeds the second for which the daemon keeps a server that left (RFC 6762, 10.1).
 const DOUBT: Duration = Duration::from_millis(2500);
 /// The largest packet of mDNS (RFC 6762, 17).

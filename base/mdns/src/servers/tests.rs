@@ -115,3 +115,14 @@ async fn of_two_servers_with_one_name_one_is_called_otherwise() {
     assert_eq!((&*from, &*to), ("arm", "arm (2)"));
     assert!(!first, "the one whose URL comes later gives way");
 }
+
+#[test]
+fn announcements_become_less_frequent_with_the_number_of_servers() {
+    let ms = Duration::from_millis;
+    let soon = |servers| shared(SETTLE..=SETTLE_LATE, servers);
+    assert_eq!([0, 8, 100].map(soon), [ms(200), ms(200), ms(2_500)]);
+    // Invented servers do not silence this program.
+    assert_eq!(soon(usize::MAX), SETTLE_LATE);
+    let again = |servers| shared(ANNOUNCE_EVERY..=ANNOUNCE_SELDOM, servers);
+    assert_eq!([1, 100].map(again), [ms(5_000), ms(60_000)]);
+}
