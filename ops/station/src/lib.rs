@@ -32,6 +32,7 @@ mod copy;
 pub mod entry;
 mod face;
 mod feed;
+mod looks;
 mod marks;
 mod mirror;
 mod station;

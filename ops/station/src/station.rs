@@ -30,6 +30,7 @@ use crate::budget::NodeBudget;
 use crate::callers::Admission;
 use crate::configure::Told;
 use crate::face::{Face, FaceSettings, id};
+use crate::looks::Looks;
 use crate::marks::Sessions;
 use crate::tend::Tending;
 
@@ -114,6 +115,7 @@ pub async fn run(
         own_uri: uri.clone(),
         registered: watch::Sender::default(),
         nodes: NodeBudget::default(),
+        looks: Looks::default(),
     };
     levels.below = Some(Abort(
         tokio::spawn(tend_below(events, tending)).abort_handle(),
@@ -191,6 +193,7 @@ impl Common<'_> {
             own_uri: (*uri).to_owned(),
             registered: watch::Sender::default(),
             nodes: NodeBudget::default(),
+            looks: Looks::default(),
         };
         levels.above = Some(follow(upper, tending)?);
         levels.announced = tell(settings, upper, uri, (&above, &below))?;

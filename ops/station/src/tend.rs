@@ -14,7 +14,7 @@ use plant_opcua::types::{DateTime, ObjectId, ObjectTypeId, StatusCode};
 use registry::hierarchy::Place;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, sleep};
+use tokio::time::sleep;
 use tracing::{info, warn};
 
 use crate::board::{BUSY, Board, CONNECTED, Level};
@@ -24,7 +24,8 @@ use crate::configure::Told;
 use crate::copy::{CopiedVariable, ServerCopy};
 use crate::face::Face;
 use crate::feed::{self, Target};
-use crate::mirror::{self, Mirror};
+use crate::looks::Looks;
+use crate::mirror::Mirror;
 
 /// Data that the supervisors of all servers of a level share.
 pub(crate) struct Tending {
@@ -43,6 +44,8 @@ pub(crate) struct Tending {
     pub(crate) registered: watch::Sender<BTreeSet<String>>,
     /// The nodes that the face shows of all servers.
     pub(crate) nodes: NodeBudget,
+    /// The searches for the nodes of all servers.
+    pub(crate) looks: Looks,
 }
 
 impl Tending {
@@ -161,14 +164,14 @@ impl Tending {
     ) {
         let mut known = None;
         let mut feeds = Feeds::default();
+        let mut searched = self.looks.enter();
         let mut changes = of.client.subscribe(vec![model_changes()], TOLD_EVERY, 10);
         loop {
-            let began = Instant::now();
             // The run before the search: its NodeIds are not valid for a later run.
             let run = of.client.started();
             // A server that executes a method may not respond to other requests.
             if known.is_none() || !of.client.is_calling() {
-                let looked = mirror::look(of.client).await;
+                let looked = searched.look(of.client).await;
                 match looked.map(|looked| self.within_budget(of.url, looked)) {
                     Ok(looked) if known.as_ref() != Some(&looked) => {
                         self.show((of, run), &looked, copy.as_mut(), &mut feeds)
@@ -218,7 +221,7 @@ impl Tending {
                 // device appears or disappears.
                 () = changed(&mut changes), if is_told => {}
                 // Not every server notifies model changes.
-                () = sleep(LOOK_AGAIN.max(began.elapsed() * LOOK_SELDOM)) => {}
+                () = sleep(searched.pause()) => {}
             }
         }
     }
@@ -499,9 +502,6 @@ const ANSWERS_NOTHING: &str =
 const ASK_LIMIT: Duration = Duration::from_secs(2);
 /// Publishing interval of the subscription to model changes.
 const TOLD_EVERY: Duration = Duration::from_millis(50);
-const LOOK_AGAIN: Duration = Duration::from_secs(2);
-/// A search of a server's nodes takes at most one part in so many of the time.
-const LOOK_SELDOM: u32 = 20;
 /// Number of subscriptions at a server that grows, before they become one again.
 const MOST_FEEDS: usize = 16;
 const FIRST_WAIT: Duration = Duration::from_millis(250);
