@@ -1,22 +1,28 @@
 //! The current state of the plant: the components in the graph, their skills, and the runs.
 
+mod facts;
+mod opened;
 mod parameters;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use async_trait::async_trait;
-use knowledge::{
-    Answer, ComponentFacts, Knowledge, Lasting, NodeName, ParameterFacts, SkillFacts, Source,
-    SourceKind, TypeFacts,
-};
+use futures_util::future::join_all;
+use knowledge::{Answer, ComponentFacts, Knowledge, Lasting, NodeName, Source, SourceKind};
 use serde::Serialize;
-use skills::{ClientOptions, FoundParameter, FoundSkill, Runs as RunsOfSkill, SkillClient, Value};
+use skills::choosing::Attachment;
+use skills::{
+    ClientOptions, FoundSkill, Runs as RunsOfSkill, SkillClient, ToolState, TypeName, Value,
+};
 use tokio::sync::watch;
+use tokio::time::timeout;
 use tracing::{error, info, warn};
 
+use self::facts::skill_facts;
+use self::opened::OpenedSkills;
 use self::parameters::{connects, parameter, result, values};
 use crate::execute::{OpenFault, Opened, Plant};
 use crate::goal::{Action, Goal, Sequence};
@@ -33,6 +39,8 @@ pub(crate) struct Cell {
     /// The processes of the graph, with the change of the graph after which they were read.
     processes: Mutex<(Option<u64>, Arc<Processes>)>,
     client: ClientOptions,
+    /// The components that the user prefers, the most preferred first.
+    prefer: Vec<String>,
     present: Mutex<Present>,
     changed: watch::Sender<u64>,
     runs: Runs,
@@ -99,10 +107,12 @@ impl Cell {
         knowledge: Arc<Knowledge>,
         sources: Arc<Sources>,
         client: ClientOptions,
+        prefer: Vec<String>,
     ) -> Self {
         Self {
             knowledge,
             sources,
+            prefer,
             processes: Mutex::default(),
             client,
             present: Mutex::default(),
@@ -520,6 +530,62 @@ impl Plant for Cell {
         connects(result(&source, from.1)?, parameter(&target, to.1)?)
     }
 
+    fn reaches(&self, skill: &str, positions: &[[f64; 3]]) -> Result<(), String> {
+        let workspace = self.found(skill)?.workspace;
+        workspace.map_or(Ok(()), |workspace| workspace.allows_all(positions))
+    }
+
+    fn attachment(&self, component: &str) -> Attachment {
+        let present = self.present();
+        let endpoint = present.components.get(component).map(|of| &of.endpoint);
+        let states = present.components.values().flat_map(Component::tool_states);
+        for (_, state) in states {
+            let Some(current) = state.current.as_ref().filter(|tool| !tool.is_empty()) else {
+                continue;
+            };
+            if current == component {
+                return Attachment::AtRobot;
+            }
+            if state.mover == component || endpoint.is_some_and(|of| *of == state.mover) {
+                return Attachment::CarriesTool;
+            }
+        }
+        Attachment::None
+    }
+
+    async fn read_tools(&self) {
+        let changers: Vec<(String, String, String)> = {
+            let present = self.present();
+            let all = present.components.iter();
+            let states = all.flat_map(|(iri, of)| of.tool_states().map(move |one| (iri, of, one)));
+            let changers = states
+                .map(|(iri, of, (skill, _))| (iri.clone(), of.endpoint.clone(), skill.clone()));
+            changers.collect()
+        };
+        let read = changers.iter().map(|(_, endpoint, skill)| async move {
+            let state = timeout(TOOL_WITHIN, self.tool_state(endpoint, skill)).await;
+            state.ok().flatten()
+        });
+        let states = join_all(read).await;
+        let mut present = self.present();
+        for ((iri, _, skill), state) in changers.into_iter().zip(states) {
+            let component = present.components.get_mut(&iri);
+            let found = component.and_then(|component| component.found.get_mut(&skill));
+            if let Some(known) = found.and_then(|found| found.tool_state.as_mut()) {
+                // The tool of a changer that does not respond is unknown.
+                let unknown = || ToolState {
+                    current: None,
+                    ..known.clone()
+                };
+                *known = state.unwrap_or_else(unknown);
+            }
+        }
+    }
+
+    fn prefer(&self) -> &[String] {
+        &self.prefer
+    }
+
     fn used_by_others(&self, run: &str) -> BTreeMap<String, String> {
         let leases = self.leases();
         let others = leases.iter().filter(|(_, holder)| *holder != run);
@@ -572,67 +638,23 @@ impl Plant for Cell {
     }
 }
 
-struct OpenedSkills {
-    clients: Vec<SkillClient>,
-    skills: Vec<Arc<dyn RunsOfSkill>>,
-}
-
-#[async_trait]
-impl Opened for OpenedSkills {
-    fn skills(&self) -> Vec<Arc<dyn RunsOfSkill>> {
-        self.skills.clone()
-    }
-
-    async fn close(self: Box<Self>) {
-        drop(self.skills);
-        for client in self.clients {
-            client.close().await;
-        }
+impl Cell {
+    /// Reads the state of the tool changer with a skill.
+    async fn tool_state(&self, endpoint: &str, skill: &str) -> Option<ToolState> {
+        let node = self.found(skill).ok()?.node;
+        let client = SkillClient::connect(endpoint, &self.client).await.ok()?;
+        let found = client.skills_of(&TypeName::own("ToolSkillType")).await;
+        client.close().await;
+        let mut found = found.ok()?.into_iter();
+        found.find(|found| found.node == node)?.tool_state
     }
 }
 
-fn skill_facts(found: &FoundSkill) -> Option<SkillFacts> {
-    let parameters = found
-        .parameters
-        .iter()
-        .map(|parameter| parameter_facts(parameter, false));
-    let results = found
-        .results
-        .iter()
-        .map(|parameter| parameter_facts(parameter, true));
-    let of_type = |of: &skills::FoundType| TypeFacts {
-        node: NodeName {
-            namespace: of.name.namespace.clone(),
-            identifier: of.identifier.clone(),
-        },
-        browse_name: of.name.name.clone(),
-    };
-    Some(SkillFacts {
-        name: found.name.clone(),
-        number: found.number.map(u32::from),
-        node: NodeName::parse(&found.node)?,
-        types: found.types.iter().map(of_type).collect(),
-        capabilities: found.capabilities.clone(),
-        parameters: parameters.chain(results).collect(),
-    })
-}
-
-fn parameter_facts(parameter: &FoundParameter, is_output: bool) -> ParameterFacts {
-    let rank = if parameter.shape.array { "[]" } else { "" };
-    ParameterFacts {
-        name: parameter.name.clone(),
-        is_output,
-        data_type: format!("{:?}{rank}", parameter.shape.builtin),
-        is_required: !is_output && parameter.default.is_none(),
-        default: parameter
-            .default
-            .as_ref()
-            .filter(|_| !is_output)
-            .map(|value| value.to_json().to_string()),
-        min: parameter.range.map(|range| range.0),
-        max: parameter.range.map(|range| range.1),
-        unit: parameter.unit.clone(),
-        node: NodeName::parse(&parameter.node),
+impl Component {
+    /// Returns the states of its tool changers, with the IRIs of their skills.
+    fn tool_states(&self) -> impl Iterator<Item = (&String, &ToolState)> {
+        let found = self.found.iter();
+        found.filter_map(|(skill, found)| Some((skill, found.tool_state.as_ref()?)))
     }
 }
 
@@ -654,5 +676,7 @@ pub(crate) fn since_1970(at: SystemTime) -> u64 {
 }
 
 const MOST_GONE: usize = 100;
+/// Time limit to read the state of a tool changer.
+const TOOL_WITHIN: Duration = Duration::from_secs(2);
 /// Number of processes that an error names.
 const MOST_SHOWN: usize = 50;

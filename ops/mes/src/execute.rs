@@ -11,6 +11,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
+use skills::choosing::Attachment;
 use skills::frame::Frame;
 use skills::{PickAndPlace, Runs, Teller, Value};
 use tokio::sync::watch;
@@ -47,6 +48,24 @@ pub(crate) trait Plant: Send + Sync {
 
     /// Checks that a result of a skill can be a parameter of another skill.
     fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String>;
+
+    /// Checks that the robot with a skill reaches positions.
+    fn reaches(&self, _skill: &str, _positions: &[[f64; 3]]) -> Result<(), String> {
+        Ok(())
+    }
+
+    /// Returns what a component is attached to, as the tool changers showed last.
+    fn attachment(&self, _component: &str) -> Attachment {
+        Attachment::None
+    }
+
+    /// Reads the tools of the tool changers.
+    async fn read_tools(&self) {}
+
+    /// Returns the components that the user prefers, the most preferred first.
+    fn prefer(&self) -> &[String] {
+        &[]
+    }
 
     /// Returns the components that other runs use, with these runs.
     fn used_by_others(&self, run: &str) -> BTreeMap<String, String>;
@@ -222,6 +241,18 @@ impl Facts for OfPlant<'_> {
     fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String> {
         self.0.connects(from, to)
     }
+
+    fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), String> {
+        self.0.reaches(&offer.skill, positions)
+    }
+
+    fn attachment(&self, offer: &Offer) -> Attachment {
+        self.0.attachment(&offer.component)
+    }
+
+    fn prefer(&self) -> &[String] {
+        self.0.prefer()
+    }
 }
 
 struct Execution<'a> {
@@ -310,6 +341,7 @@ impl Execution<'_> {
         tokio::pin!(wait);
         loop {
             changes.mark_unchanged();
+            self.plant.read_tools().await;
             let offers = self.plant.offers();
             let (fallen, used) = (self.log.fallen(), self.plant.used_by_others(&run));
             let situation = Situation {

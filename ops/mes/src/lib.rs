@@ -183,7 +183,8 @@ impl UaMes {
             within: WITHIN,
             ..ClientOptions::default()
         };
-        let cell = Arc::new(Cell::new(Arc::clone(&knowledge), sources, client));
+        let prefer = settings.prefer.clone();
+        let cell = Arc::new(Cell::new(Arc::clone(&knowledge), sources, client, prefer));
         if let Some(iri) = self.run.as_deref().filter(|iri| cell.process(iri).is_err()) {
             return Err(Failure::new(
                 FailureKind::Usage,

@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use knowledge::Answer;
 use serde::Serialize;
 use skills::TypeName;
+use skills::choosing::{self, Attachment, Rank, choose};
 
 use crate::process::{By, Group, Job, Need, Process, Role, Step};
 
@@ -184,6 +185,32 @@ pub(crate) trait Facts {
 
     /// Checks that a result of a skill, given by its IRI, can be a parameter of another skill.
     fn connects(&self, from: (&str, &str), to: (&str, &str)) -> Result<(), String>;
+
+    /// Checks that the robot of an offer reaches positions.
+    fn reaches(&self, _offer: &Offer, _positions: &[[f64; 3]]) -> Result<(), String> {
+        Ok(())
+    }
+
+    /// Returns what the component of an offer is attached to.
+    fn attachment(&self, _offer: &Offer) -> Attachment {
+        Attachment::None
+    }
+
+    /// Returns the components that the user prefers, the most preferred first.
+    fn prefer(&self) -> &[String] {
+        &[]
+    }
+}
+
+/// Returns the rank of an offer for needs.
+fn rank(needs: &[&Need], offer: &Offer, facts: &dyn Facts) -> Rank {
+    Rank {
+        attachment: facts.attachment(offer),
+        preference: Rank::preference(facts.prefer(), &offer.component),
+        inexact: usize::from(!is_exact(needs, offer)),
+        since_ms: offer.since_ms,
+        name: offer.component.clone(),
+    }
 }
 
 /// Plans a process with the available skills.
@@ -226,7 +253,7 @@ pub(crate) fn plan(
             let roles: Vec<_> = of_group
                 .map(|(role, needs)| (*role, needs.clone()))
                 .collect();
-            (group, Team::of(&roles, &fitting))
+            (group, Team::of(&roles, &fitting, facts))
         })
         .collect();
     let team = |need: &Need| groups.get(&need.role).and_then(|group| teams.get(group));
@@ -402,7 +429,11 @@ struct Team<'a> {
 }
 
 impl<'a> Team<'a> {
-    fn of(roles: &[(Role, Vec<&Need>)], fitting: &BTreeMap<Role, Vec<&'a Offer>>) -> Self {
+    fn of(
+        roles: &[(Role, Vec<&Need>)],
+        fitting: &BTreeMap<Role, Vec<&'a Offer>>,
+        facts: &dyn Facts,
+    ) -> Self {
         let of_role = |role: &Role| fitting.get(role).into_iter().flatten().copied();
         let components: BTreeSet<&str> = roles
             .iter()
@@ -413,18 +444,27 @@ impl<'a> Team<'a> {
         let mut teams = Vec::new();
         for component in components {
             let mut chosen = BTreeMap::new();
-            let mut exact = 0;
+            let mut whole = Rank::default();
             for (role, needs) in roles {
                 let of_component = of_role(role).filter(|offer| offer.component == component);
                 let best = of_component
                     .min_by_key(|offer| (Reverse(is_exact(needs, offer)), offer.skill.as_str()));
                 if let Some(best) = best {
-                    exact += usize::from(is_exact(needs, best));
+                    let rank = rank(needs, best, facts);
+                    whole = Rank {
+                        inexact: whole.inexact + rank.inexact,
+                        ..rank
+                    };
                     chosen.insert(*role, best);
                 }
             }
             if chosen.len() == roles.len() {
-                teams.push((exact, chosen));
+                teams.push(choosing::Candidate {
+                    of: chosen,
+                    name: component.to_owned(),
+                    fits: Ok(()),
+                    rank: whole,
+                });
             } else {
                 let missing = roles
                     .iter()
@@ -434,21 +474,10 @@ impl<'a> Team<'a> {
                 lacks.insert(component, missing);
             }
         }
-        // Components with the exact capabilities come before components with subclasses; then the
-        // longest available component comes first.
-        let rank = |(exact, chosen): &(usize, BTreeMap<Role, &'a Offer>)| {
-            let first = chosen.values().next();
-            (
-                Reverse(*exact),
-                first.map(|offer| offer.since_ms),
-                first.map(|offer| offer.component.as_str()),
-            )
-        };
-        let best = teams
-            .into_iter()
-            .min_by(|one, other| rank(one).cmp(&rank(other)));
+        // The names of components differ, so no two of them are equal.
+        let chosen = choose(teams).map(|choice| choice.chosen);
         Self {
-            chosen: best.map(|(_, chosen)| chosen).unwrap_or_default(),
+            chosen: chosen.unwrap_or_default(),
             lacks,
         }
     }

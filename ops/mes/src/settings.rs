@@ -45,6 +45,8 @@ pub(crate) struct Settings {
     /// Recipes of BatchML and BPMN.
     pub(crate) recipes: Vec<RecipeSource>,
     pub(crate) processes: Vec<Process>,
+    /// The ApplicationUris of components that are preferred among others, the most preferred first.
+    pub(crate) prefer: Vec<String>,
 }
 
 impl Settings {
@@ -71,7 +73,7 @@ impl Settings {
 }
 
 /// Keys of the document.
-const KEYS: [&str; 17] = [
+const KEYS: [&str; 18] = [
     "mes",
     "application_uri",
     "namespace",
@@ -89,6 +91,7 @@ const KEYS: [&str; 17] = [
     "rml",
     "recipes",
     "processes",
+    "prefer",
 ];
 
 struct Reading<'a> {
@@ -116,6 +119,7 @@ impl Reading<'_> {
             rml,
             recipes,
             processes,
+            prefer,
         ] = self.reader.map(root, KEYS)?;
         let name = self
             .reader
@@ -135,10 +139,7 @@ impl Reading<'_> {
         let security = security.map_or_else(usual, |node| self.security(node));
         let lds = lds.map_or(Some(Lds::Local), |node| self.lds(node));
         let open = open.map_or(Some(false), |node| self.reader.boolean(node));
-        let user = match user {
-            Some(node) => Some(skills::read_user(node, self.folder, &mut self.reader)?),
-            None => None,
-        };
+        let user = user.map(|node| skills::read_user(node, self.folder, &mut self.reader));
         let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node));
         let store = match store {
             Some(node) => Some(self.reader.text(node, "the path of a folder")?),
@@ -151,6 +152,7 @@ impl Reading<'_> {
         let rml = rml.map_or_else(Vec::new, |node| self.each(node, Self::rml));
         let recipes = recipes.map_or_else(Vec::new, |node| self.each(node, Self::recipe));
         let processes = processes.map_or_else(Vec::new, |node| self.each(node, Self::process));
+        let prefer = prefer.map_or_else(Vec::new, |node| self.each(node, Self::preferred));
         let names = manifests.iter().map(|manifest| &*manifest.source.name);
         self.once(root, names, "manifest");
         self.files_once(root, &knowledge, &rml);
@@ -165,7 +167,7 @@ impl Reading<'_> {
             security: security?,
             lds: lds?,
             open: open?,
-            user,
+            user: user.map_or(Some(None), |user| user.map(Some))?,
             sparql: sparql?,
             store: store.map(|path| self.folder.join(path)),
             rules: rules?,
@@ -175,6 +177,7 @@ impl Reading<'_> {
             rml,
             recipes,
             processes,
+            prefer,
         })
     }
 
@@ -209,6 +212,10 @@ impl Reading<'_> {
             }
             seen.push(name);
         }
+    }
+
+    fn preferred(&mut self, node: &Node) -> Option<String> {
+        self.iri(node, Code::Uri)
     }
 
     fn process(&mut self, node: &Node) -> Option<Process> {

@@ -6,6 +6,7 @@
 
 mod actor;
 mod authority;
+pub mod choosing;
 pub mod client;
 mod component;
 mod composite;

@@ -58,6 +58,14 @@ impl Workspace {
         ))
     }
 
+    /// Checks that all positions are within the reach and in a zone.
+    ///
+    /// # Errors
+    /// The reason why the robot does not go to the first of the others.
+    pub fn allows_all(&self, positions: &[[f64; 3]]) -> Result<(), String> {
+        positions.iter().try_for_each(|at| self.allows(*at))
+    }
+
     /// Checks the target of a move among the parameters of a skill.
     ///
     /// # Errors

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use skills::TypeName;
 
-use super::{Candidate, Facts, Offer, Plan, PlannedNeed, Situation, Team, is_exact};
+use super::{Candidate, Facts, Offer, Plan, PlannedNeed, Situation, Team, rank};
 use crate::process::{By, Group, Job, Need, Process, Role, Step};
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -291,6 +291,12 @@ impl<'a> Judging<'a> {
         if let Some(step) = self.step(need.role) {
             self.facts.takes(offer, step).map_err(NotFit::Because)?;
         }
+        if let (Job::PickAndPlace(job), Role::Ptp | Role::Linear) = (&self.process.work, need.role)
+        {
+            let positions = [job.pick, job.place].map(|[x, y, z, ..]| [x, y, z]);
+            let reached = self.facts.reaches(offer, &positions);
+            reached.map_err(NotFit::Because)?;
+        }
         for result in self.taken(need.role) {
             self.facts.gives(offer, result).map_err(NotFit::Because)?;
         }
@@ -374,17 +380,13 @@ impl<'a> Judging<'a> {
         let Some(chosen) = chosen else {
             return "it would fit this step".to_owned();
         };
-        let better = if is_exact(&[need], chosen) && !is_exact(&[need], offer) {
-            "is of just this capability"
-        } else if chosen.since_ms < offer.since_ms {
-            "has been there for longer"
-        } else {
-            "comes first by its name"
-        };
-        format!(
-            "it would fit, but {}.{} {better}",
-            chosen.component_name, chosen.name
-        )
+        let (mut best, mut rank) = (
+            rank(&[need], chosen, self.facts),
+            rank(&[need], offer, self.facts),
+        );
+        let name = |offer: &Offer| format!("{}.{}", offer.component_name, offer.name);
+        (best.name, rank.name) = (chosen.skill.clone(), offer.skill.clone());
+        rank.why_not((&name(chosen), &best))
     }
 }
 

@@ -48,6 +48,91 @@ impl Facts for Known {
 
 const KNOWN: Known = Known { refuses: ("", "") };
 
+/// Facts by which one robot reaches nothing, one gripper is attached, and the user prefers some.
+struct Preferring {
+    attached: &'static str,
+    prefer: Vec<String>,
+}
+
+impl Facts for Preferring {
+    fn takes(&self, _: &Offer, _: &Step) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn gives(&self, _: &Offer, _: &str) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn connects(&self, _: (&str, &str), _: (&str, &str)) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn reaches(&self, offer: &Offer, positions: &[[f64; 3]]) -> Result<(), String> {
+        assert_eq!(positions, [[0.0; 3], [1.0; 3]]);
+        let workspace = skills::Workspace {
+            reach: (offer.component_name == "short").then_some(0.5),
+            zones: Vec::new(),
+        };
+        workspace.allows_all(positions)
+    }
+
+    fn attachment(&self, offer: &Offer) -> Attachment {
+        match offer.component_name == self.attached {
+            true => Attachment::AtRobot,
+            false => Attachment::None,
+        }
+    }
+
+    fn prefer(&self) -> &[String] {
+        &self.prefer
+    }
+}
+
+#[test]
+fn reach_attached_tools_and_the_rules_of_the_user_decide_with_a_reason_for_each() {
+    let offers = [
+        robot("a-short"),
+        robot("short"),
+        robot("b-robot"),
+        gripper("fingers"),
+        gripper("vacuum"),
+    ]
+    .concat();
+    let planned = |attached, prefer: &[&str]| {
+        let facts = Preferring {
+            attached,
+            prefer: prefer
+                .iter()
+                .map(|name| format!("urn:example:{name}"))
+                .collect(),
+        };
+        super::plan(&process(), &offers, Situation::default(), &facts)
+    };
+    let plain = planned("", &[]);
+    assert_eq!(plain.chosen(Role::Ptp), Some("urn:example:a-short#Ptp"));
+    assert_eq!(plain.chosen(Role::Grasp), Some("urn:example:fingers#Grasp"));
+    assert_eq!(
+        why(&plain, Role::Ptp, "short#Ptp"),
+        "1.000, 1.000, 1.000 m is 1.732 m from its base, and it reaches 0.5 m"
+    );
+    let ruled = planned("", &["short", "b-robot", "vacuum"]);
+    assert_eq!(ruled.chosen(Role::Ptp), Some("urn:example:b-robot#Ptp"));
+    assert_eq!(ruled.chosen(Role::Grasp), Some("urn:example:vacuum#Grasp"));
+    assert_eq!(
+        why(&ruled, Role::Linear, "a-short#Lin"),
+        "it would fit, but b-robot.Lin is preferred"
+    );
+    let attached = planned("fingers", &["vacuum"]);
+    assert_eq!(
+        attached.chosen(Role::Grasp),
+        Some("urn:example:fingers#Grasp")
+    );
+    assert_eq!(
+        why(&attached, Role::Release, "vacuum#Release"),
+        "it would fit, but fingers.Release is attached to a robot"
+    );
+}
+
 fn situation(fallen: &[Fallen]) -> Situation<'_> {
     Situation {
         fallen,

@@ -7,6 +7,7 @@ use tokio::time::timeout;
 
 use super::find::FoundSkill;
 use super::{Detected, Detector, PeerAccess, SkillClient};
+use crate::choosing::{Attachment, Candidate, Choice, NoChoice, Rank, choose};
 use crate::component::{Partner, WorldObject};
 use crate::frame::Frame;
 use crate::grip::PartShape;
@@ -27,9 +28,9 @@ pub struct ToolState {
     pub mover: String,
 }
 
-/// A component that can do a part of the work.
+/// A component that has the skills for a part of the work.
 #[derive(Debug, Clone, PartialEq)]
-struct Candidate {
+struct SkilledComponent {
     endpoint: String,
     application_uri: String,
     /// The workspaces of its moves.
@@ -56,28 +57,60 @@ pub struct Needs<'a> {
     pub prefer: &'a [String],
 }
 
-impl Candidate {
+impl SkilledComponent {
     /// Returns the reason why the component cannot do the work, if any.
     fn reaches(&self, positions: &[[f64; 3]]) -> Result<(), String> {
         let workspaces = self.workspaces.iter();
-        let mut all = workspaces.flat_map(|of| positions.iter().map(|at| of.allows(*at)));
+        let mut all = workspaces.map(|of| of.allows_all(positions));
         all.find(Result::is_err).unwrap_or(Ok(()))
+    }
+
+    fn candidate(
+        &self,
+        fits: Result<(), String>,
+        attachment: Attachment,
+        prefer: &[String],
+    ) -> Candidate<&Self> {
+        Candidate {
+            of: self,
+            name: self.application_uri.clone(),
+            fits,
+            rank: Rank {
+                attachment,
+                preference: Rank::preference(prefer, &self.application_uri),
+                ..Rank::default()
+            },
+        }
     }
 }
 
-/// Returns the only candidate, or the most preferred, with its reason. `None` if several are equal.
-fn preferred<'c>(
-    fitting: &[&'c Candidate],
-    prefer: &[String],
-    only: &str,
-) -> Option<(&'c Candidate, String)> {
-    if let [one] = fitting {
-        return Some((one, only.to_owned()));
+/// Chooses among components, and returns the reasons by their ApplicationUris.
+fn chosen(what: &str, candidates: Vec<Candidate<&SkilledComponent>>) -> Result<Chosen, String> {
+    match choose(candidates) {
+        Ok(Choice {
+            chosen,
+            reason,
+            others,
+        }) => Ok(Chosen {
+            endpoint: chosen.endpoint.clone(),
+            reason,
+            others: reasons(others),
+        }),
+        Err(NoChoice::NoneFits(others)) => {
+            Err(format!("no {what} fits: {}", reasons(others).join("; ")))
+        }
+        Err(NoChoice::Equal(equal)) => Err(format!(
+            "several {what}s are found, give one of {}",
+            list(&equal)
+        )),
     }
-    prefer.iter().find_map(|uri| {
-        let found = fitting.iter().find(|one| one.application_uri == *uri);
-        found.map(|one| (*one, "preferred".to_owned()))
-    })
+}
+
+fn reasons(others: Vec<(&SkilledComponent, String)>) -> Vec<String> {
+    let others = others.into_iter();
+    others
+        .map(|(of, why)| format!("{}: {why}", of.application_uri))
+        .collect()
 }
 
 /// The tool of a pick and place.
@@ -136,52 +169,31 @@ impl PeerAccess {
                 detector.unreadable()
             )));
         }
-        let mut fitting = Vec::new();
-        let mut others = Vec::new();
-        for robot in &robots {
-            match robot.reaches(needs.positions) {
-                Ok(()) => fitting.push(robot),
-                Err(why) => others.push(format!("{}: {why}", robot.application_uri)),
-            }
-        }
-        if fitting.is_empty() {
-            let why = format!("no robot reaches the positions: {}", others.join("; "));
-            return Err(wrong(why));
-        }
-        let only = match others.is_empty() {
-            true => "the only robot",
-            false => "the only robot that reaches the positions",
+        let reached: Vec<_> = robots
+            .iter()
+            .map(|robot| robot.reaches(needs.positions))
+            .collect();
+        let movers = match reached.iter().filter(|reached| reached.is_ok()).count() {
+            0 | 1 => Vec::new(),
+            _ => self.movers_with_tools(detector).await,
         };
-        let mut chosen = preferred(&fitting, &[], only);
-        if chosen.is_none() {
-            let mut carrying = Vec::new();
-            for (_, state) in self.changers(detector).await {
-                let has_tool = state.current.as_ref().is_some_and(|tool| !tool.is_empty());
-                let robot = fitting.iter().find(|one| is_at(one, &state.mover));
-                carrying.extend(robot.filter(|_| has_tool).copied());
-            }
-            chosen = preferred(&carrying, needs.prefer, "the only robot with a tool")
-                .or_else(|| preferred(&fitting, needs.prefer, ""));
-        }
-        let Some((robot, reason)) = chosen else {
-            let list = list(&fitting);
-            return Err(wrong(format!(
-                "several robots are found, give one of {list}"
-            )));
-        };
-        let passed = fitting.iter().filter(|one| one.endpoint != robot.endpoint);
-        others.extend(passed.map(|one| {
-            let why = match reason.as_str() {
-                "preferred" => "less preferred",
-                _ => "it has no tool",
+        let judged = robots.iter().zip(reached).map(|(robot, fits)| {
+            let carries = movers.iter().any(|mover| is_at(robot, mover));
+            let attachment = match carries {
+                true => Attachment::CarriesTool,
+                false => Attachment::None,
             };
-            format!("{}: {why}", one.application_uri)
-        }));
-        Ok(Chosen {
-            endpoint: robot.endpoint.clone(),
-            reason,
-            others,
-        })
+            robot.candidate(fits, attachment, needs.prefer)
+        });
+        chosen("robot", judged.collect()).map_err(wrong)
+    }
+
+    /// Returns the robots that carry a tool at a tool changer.
+    async fn movers_with_tools(&self, detector: &Detector) -> Vec<String> {
+        let changers = self.changers(detector).await.into_iter();
+        let has_tool = |state: &ToolState| state.current.as_ref().is_some_and(|of| !of.is_empty());
+        let carrying = changers.filter(|(_, state)| has_tool(state));
+        carrying.map(|(_, state)| state.mover).collect()
     }
 
     /// Returns the tool at the flange of a robot.
@@ -236,18 +248,16 @@ impl PeerAccess {
         if let Some(own) = grippers.iter().find(|one| is_at(one, mover)) {
             return Ok(at_flange(own.endpoint.clone(), "the gripper of the robot"));
         }
-        let all: Vec<&Candidate> = grippers.iter().collect();
-        if all.is_empty() {
+        if grippers.is_empty() {
             let unreadable = detector.unreadable();
             return Err(wrong(format!("no gripper is found{unreadable}")));
         }
-        match preferred(&all, prefer, "the only gripper") {
-            Some((one, reason)) => Ok(at_flange(one.endpoint.clone(), &reason)),
-            None => Err(wrong(format!(
-                "several grippers are found, give one of {}",
-                list(&all)
-            ))),
-        }
+        let all = grippers.iter();
+        let judged = all.map(|gripper| gripper.candidate(Ok(()), Attachment::None, prefer));
+        let Chosen {
+            endpoint, reason, ..
+        } = chosen("gripper", judged.collect()).map_err(wrong)?;
+        Ok(at_flange(endpoint, &reason))
     }
 
     /// Returns the tool changer on a robot with its current state, and its name.
@@ -356,7 +366,7 @@ fn name_of(found: &Detected) -> String {
     format!("{}.{}", found.skill.component, found.skill.name)
 }
 
-fn is_at(one: &Candidate, place: &str) -> bool {
+fn is_at(one: &SkilledComponent, place: &str) -> bool {
     is_same_endpoint(&one.endpoint, place) || one.application_uri == place
 }
 
@@ -368,7 +378,7 @@ fn uri_at(detector: &Detector, endpoint: &str) -> String {
     found.map(|one| one.application_uri).unwrap_or_default()
 }
 
-fn list(candidates: &[&Candidate]) -> String {
+fn list(candidates: &[&SkilledComponent]) -> String {
     let each = candidates
         .iter()
         .map(|one| format!("{} at {}", one.application_uri, one.endpoint));
@@ -376,7 +386,7 @@ fn list(candidates: &[&Candidate]) -> String {
 }
 
 /// Returns the components that have skills of all these types. Waits until there is one.
-async fn candidates(detector: &Detector, types: &[&str]) -> Vec<Candidate> {
+async fn candidates(detector: &Detector, types: &[&str]) -> Vec<SkilledComponent> {
     let mut changes = detector.changes();
     let find = async {
         loop {
@@ -392,7 +402,7 @@ async fn candidates(detector: &Detector, types: &[&str]) -> Vec<Candidate> {
     timeout(FOUND_WITHIN, find).await.unwrap_or_default()
 }
 
-fn having(all: &[Detected], types: &[&str]) -> Vec<Candidate> {
+fn having(all: &[Detected], types: &[&str]) -> Vec<SkilledComponent> {
     let mut components: BTreeMap<&str, (&str, Vec<&FoundSkill>)> = BTreeMap::new();
     for one in all {
         let entry = components.entry(&one.endpoint);
@@ -407,7 +417,7 @@ fn having(all: &[Detected], types: &[&str]) -> Vec<Candidate> {
         .into_iter()
         .filter(|(_, (_, skills))| has_all(skills));
     found
-        .map(|(endpoint, (application_uri, skills))| Candidate {
+        .map(|(endpoint, (application_uri, skills))| SkilledComponent {
             endpoint: endpoint.to_owned(),
             application_uri: application_uri.to_owned(),
             workspaces: skills

@@ -222,7 +222,7 @@ async fn a_skill_uses_the_tool_that_is_attached_for_objects_that_are_listed_or_l
     assert_eq!(cell.runs()[1..], [0, 1]);
     let noted = |what: &str| outcome.trace.iter().any(|line| line.contains(what));
     assert!(
-        noted("urn:test:cup is attached to urn:test:changer") && noted("the only robot"),
+        noted("urn:test:cup is attached to urn:test:changer") && noted("it is the only candidate"),
         "{:?}",
         outcome.trace
     );
@@ -336,7 +336,7 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
     let mut chosen = choose([0.9, 0.0, 0.1], &[], None).await.unwrap();
     chosen.others.sort();
     assert_eq!(chosen.endpoint, robots[2].url());
-    assert_eq!(chosen.reason, "the only robot that reaches the positions");
+    assert_eq!(chosen.reason, "it is the only candidate that fits");
     let others = [
         format!("urn:test:short: {too_far}"),
         format!("urn:test:table: {out_of_zone}"),
@@ -349,12 +349,12 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
     let prefer = ["urn:test:short", "urn:test:table"];
     let chosen = choose([0.4, 0.2, 0.1], &prefer, None).await.unwrap();
     assert_eq!(chosen.endpoint, robots[1].url());
-    assert_eq!(chosen.reason, "preferred");
-    let less = "urn:test:far: less preferred".to_owned();
+    assert_eq!(chosen.reason, "it is preferred");
+    let less = "urn:test:far: it would fit, but urn:test:table is preferred".to_owned();
     assert!(chosen.others.contains(&less), "{:?}", chosen.others);
 
     let none = choose([1.5, 0.0, 0.1], &prefer, None).await.unwrap_err();
-    assert!(none.contains("no robot reaches the positions: "), "{none}");
+    assert!(none.contains("no robot fits: "), "{none}");
     let named = choose([0.9, 0.0, 0.1], &[], Some("urn:test:short")).await;
     assert!(named.unwrap_err().contains(too_far));
 

@@ -1,0 +1,28 @@
+//! The skills that a run has opened.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use skills::{Runs, SkillClient};
+
+use crate::execute::Opened;
+
+/// Skills over the connections to their components.
+pub(super) struct OpenedSkills {
+    pub(super) clients: Vec<SkillClient>,
+    pub(super) skills: Vec<Arc<dyn Runs>>,
+}
+
+#[async_trait]
+impl Opened for OpenedSkills {
+    fn skills(&self) -> Vec<Arc<dyn Runs>> {
+        self.skills.clone()
+    }
+
+    async fn close(self: Box<Self>) {
+        drop(self.skills);
+        for client in self.clients {
+            client.close().await;
+        }
+    }
+}
