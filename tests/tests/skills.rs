@@ -367,9 +367,21 @@ fn a_type_of_another_maker_is_loaded_found_by_its_supertype_and_run_by_other_cli
     assert!(printed.wait_for_end(SOON).success());
     let nodeset = cell.file("skills.xml", &printed.lines().join("\n"));
     let vendor = Path::new(EXAMPLES).join("vacuum-gripper.xml");
+    let schema = test_data::foreign("nodesets/UANodeSet.xsd");
+    let schema = schema
+        .as_ref()
+        .map(|path| ["--xsd", path.to_str().unwrap()]);
     let files = [nodeset.to_str().unwrap(), vendor.to_str().unwrap()];
-    let loaded = cell.asyncua_once("opcua_import.py", &files);
+    let args: Vec<&str> = schema.into_iter().flatten().chain(files).collect();
+    let loaded = cell.asyncua_once("opcua_import.py", &args);
     assert_eq!(loaded[0]["complaints"], json!([]));
+    // Null without the schema, or without a library that applies it.
+    let faults = &loaded[0]["faults"];
+    assert!(*faults == json!([]) || faults.is_null(), "{faults}");
+    assert_eq!(
+        loaded[0]["entries"]["GraspSkillType"],
+        json!(["http://www.hsu-ifa.de/ontologies/VDI2860#Tensioning"])
+    );
     assert_eq!(
         loaded[0]["types"]["GraspSkillType"],
         json!(["GripperSkillType"])

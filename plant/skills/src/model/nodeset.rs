@@ -1,5 +1,6 @@
 //! The table as a NodeSet2 document (OPC 10000-6, annex F).
 
+mod dictionary;
 mod domains;
 mod methods;
 
@@ -28,6 +29,7 @@ pub fn nodeset() -> String {
     nodes.event_type();
     nodes.controller_type();
     nodes.used_skills();
+    nodes.dictionary();
     let mut text = nodes.0;
     text.push_str("</UANodeSet>\n");
     text
@@ -157,7 +159,7 @@ impl Nodes {
         if of.is_abstract {
             node = node.attribute("IsAbstract", "true");
         }
-        node = node.back("HasSubtype", supertype);
+        node = dictionary::refer(node.back("HasSubtype", supertype), of);
         let is_root = of.name == SKILL_TYPE;
         if is_root {
             node = node.forward("GeneratesEvent", own(EVENT_TYPE_ID));
@@ -676,6 +678,7 @@ const HEAD: &str = r#"<?xml version="1.0" encoding="utf-8"?>
     <Alias Alias="HasSubtype">i=45</Alias>
     <Alias Alias="HasProperty">i=46</Alias>
     <Alias Alias="HasComponent">i=47</Alias>
+    <Alias Alias="HasDictionaryEntry">i=17597</Alias>
   </Aliases>
 "#;
 

@@ -65,6 +65,7 @@ fn part(at: usize) -> String {
         nodes.event_type();
         nodes.controller_type();
         nodes.used_skills();
+        nodes.dictionary();
     }
     let mut text = nodes.0;
     text.push_str("</UANodeSet>\n");
