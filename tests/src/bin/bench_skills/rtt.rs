@@ -1,5 +1,5 @@
 //! The round-trip times of a skill, an OPC UA method, a ROS 1 service, a ROS 2 service and UADP,
-//! for payloads of 8 B to 1 MiB, idle and with both cores busy.
+//! for payloads of 8 B to 1 MiB, idle, with both cores busy, and with a loaded network.
 
 use std::net::UdpSocket;
 use std::sync::Arc;
@@ -41,15 +41,14 @@ pub(crate) fn all(runs: usize) -> Option<()> {
         println!("| path | load | 8 B | 1 KiB | 64 KiB | 1 MiB |");
         println!("|---|---|---|---|---|---|");
         for name in NAMES {
-            for is_busy in [false, true] {
-                let busy = is_busy.then(Busy::start);
+            for load in [Load::None, Load::Cores, Load::Network] {
+                let loaded = load.start();
                 let mut cells = Vec::new();
                 for size in SIZES {
                     cells.push(paths.measure(name, size, runs).await);
                 }
-                let load = if is_busy { "both cores busy" } else { "idle" };
-                println!("| {name} | {load} | {} |", cells.join(" | "));
-                drop(busy);
+                println!("| {name} | {} | {} |", load.name(), cells.join(" | "));
+                drop(loaded);
             }
         }
     });
@@ -449,26 +448,71 @@ impl UadpEnd {
     }
 }
 
-/// Threads that keep both cores busy.
+/// A load beside the round trips.
+#[derive(Debug, Clone, Copy)]
+enum Load {
+    None,
+    Cores,
+    Network,
+}
+
+impl Load {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::None => "idle",
+            Self::Cores => "both cores busy",
+            Self::Network => "45 MB/s of datagrams",
+        }
+    }
+
+    fn start(self) -> Busy {
+        let stop = Arc::<AtomicBool>::default();
+        let threads = match self {
+            Self::None => Vec::new(),
+            Self::Cores => (0..2).map(|_| spin(&stop)).collect(),
+            Self::Network => vec![flood(&stop)],
+        };
+        Busy { stop, threads }
+    }
+}
+
+/// Starts a thread that keeps a core busy.
+fn spin(stop: &Arc<AtomicBool>) -> JoinHandle<()> {
+    let stop = Arc::clone(stop);
+    std::thread::spawn(move || {
+        while !stop.load(Ordering::Relaxed) {
+            std::hint::spin_loop();
+        }
+    })
+}
+
+/// Starts a thread that sends 32 datagrams of 1400 B in each millisecond over loopback.
+fn flood(stop: &Arc<AtomicBool>) -> JoinHandle<()> {
+    let stop = Arc::clone(stop);
+    let [from, to] = [(), ()].map(|()| UdpSocket::bind("127.0.0.1:0").unwrap());
+    from.connect(to.local_addr().unwrap()).unwrap();
+    to.set_nonblocking(true).unwrap();
+    std::thread::spawn(move || {
+        let mut datagram = [0; 1400];
+        let began = Instant::now();
+        for millisecond in 1.. {
+            if stop.load(Ordering::Relaxed) {
+                return;
+            }
+            for _ in 0..32 {
+                from.send(&datagram).unwrap();
+            }
+            while to.recv(&mut datagram).is_ok() {}
+            let next = began + Duration::from_millis(millisecond);
+            std::thread::sleep(next.saturating_duration_since(Instant::now()));
+        }
+    })
+}
+
+/// The threads of a load, which end when it is dropped.
 struct Busy {
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
-}
-
-impl Busy {
-    fn start() -> Self {
-        let stop = Arc::<AtomicBool>::default();
-        let threads = (0..2).map(|_| {
-            let stop = Arc::clone(&stop);
-            std::thread::spawn(move || {
-                while !stop.load(Ordering::Relaxed) {
-                    std::hint::spin_loop();
-                }
-            })
-        });
-        let threads = threads.collect();
-        Self { stop, threads }
-    }
 }
 
 impl Drop for Busy {
