@@ -281,6 +281,7 @@ fn are_answered_alike(cell: &Cell, knowledge: &Knowledge, device: &str) {
         "goals",
         "objects",
         "process-conditions",
+        "process-loops",
         "process-parameters",
         "process-steps",
         "processes",

@@ -267,6 +267,8 @@ struct Execution<'a> {
 /// The result of a plan.
 enum Ended {
     Done,
+    /// Another round of a loop is due, which is planned anew.
+    Round,
     /// Another plan can do the work.
     Broken(String),
     /// No other plan can do the work.
@@ -295,7 +297,10 @@ impl Execution<'_> {
     /// Runs plans until all steps are done.
     async fn forward(&self, progress: &mut Progress) -> Result<(), String> {
         let mut last = String::new();
-        for number in 1..=MOST_PLANS {
+        let mut number = 0_usize;
+        let mut broken = 0_usize;
+        while broken < MOST_PLANS {
+            number = number.saturating_add(1);
             let (plan, chosen) = self.planned(&last, progress).await?;
             self.log.change(|kept, now| {
                 kept.run.waits_for = None;
@@ -303,7 +308,7 @@ impl Execution<'_> {
             });
             let ended = self.carry_out(&chosen, progress).await;
             let (outcome, reason) = match &ended {
-                Ended::Done => (How::Done, None),
+                Ended::Done | Ended::Round => (How::Done, None),
                 Ended::Broken(why) | Ended::Over(why) => (How::Failed, Some(why.clone())),
             };
             self.log.change(|kept, now| {
@@ -313,11 +318,16 @@ impl Execution<'_> {
             });
             match ended {
                 Ended::Done => return Ok(()),
+                Ended::Round => {
+                    self.log.forgive();
+                    last.clear();
+                }
                 Ended::Over(why) => return Err(why),
                 // The step whose end is unknown may go on; no other component repeats it.
                 Ended::Broken(why) if self.log.run().is_unknown() => return Err(why),
                 Ended::Broken(why) => {
                     warn!(plan = number, "a plan failed: {why}");
+                    broken = broken.saturating_add(1);
                     last = why;
                 }
             }
@@ -592,6 +602,12 @@ impl Log {
         );
     }
 
+    /// Forgets failed skills: the process repeats their steps, so another round may use them again.
+    /// Lost components stay.
+    fn forgive(&self) {
+        self.change(|kept, _| kept.fallen.retain(|fallen| fallen.skill.is_none()));
+    }
+
     fn fell(&self, fallen: Fallen) {
         self.change(|kept, now| {
             if let Some(plan) = kept.run.plan().filter(|_| fallen.skill.is_none()) {
@@ -604,7 +620,8 @@ impl Log {
     }
 }
 
-/// Maximum number of plans of a run.
+/// Maximum number of plans of a run that may break. Rounds of loops are bounded by their own
+/// maximum.
 const MOST_PLANS: usize = 10;
 const MOST_FALLEN: usize = 100;
 const CLOSE: Duration = Duration::from_secs(3);

@@ -226,6 +226,7 @@ impl Goal {
             name: self.name.clone(),
             work: Job::Sequence,
             steps: sequence.steps.iter().enumerate().map(step).collect(),
+            loops: Vec::new(),
             within: self.within.unwrap_or(USUALLY_WITHIN),
             wait: self.wait.unwrap_or(USUALLY_WAIT),
         }

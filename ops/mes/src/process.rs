@@ -1,5 +1,6 @@
 //! Processes: their steps and the needs of each step.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use knowledge::{is_iri, vocabulary as v};
@@ -14,6 +15,8 @@ pub(crate) struct Process {
     pub(crate) work: Job,
     /// The steps in order.
     pub(crate) steps: Vec<Step>,
+    /// The parts of a sequence that are repeated.
+    pub(crate) loops: Vec<Loop>,
     /// Time limit of each run of a skill.
     pub(crate) within: Duration,
     /// Time to wait for a component that a plan needs.
@@ -47,6 +50,30 @@ pub(crate) struct Step {
     pub(crate) when: Vec<Vec<Condition>>,
     /// Time limit of the skill, if it differs from that of the process.
     pub(crate) within: Option<Duration>,
+}
+
+/// Steps of a sequence that are done in rounds. When all of them are over, another round begins if
+/// its conditions hold. Other steps wait for the last round.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Loop {
+    /// The numbers of its steps.
+    pub(crate) steps: BTreeSet<usize>,
+    /// Another round begins if all conditions of one of these alternatives hold.
+    pub(crate) again: Vec<Vec<Condition>>,
+    /// The run fails when another round is due after this number of rounds.
+    pub(crate) rounds: u32,
+}
+
+impl Loop {
+    /// Maximum number of rounds of a loop that does not state one.
+    pub(crate) const USUAL_ROUNDS: u32 = 100;
+    /// Largest possible maximum: each round is a plan of its own in the record of the run.
+    pub(crate) const MOST_ROUNDS: u32 = 500;
+
+    /// Returns whether a loop is a part of another loop.
+    pub(crate) fn is_within(&self, other: &Self) -> bool {
+        self.steps.is_subset(&other.steps) && self.steps.len() < other.steps.len()
+    }
 }
 
 /// A condition about an earlier step.
@@ -286,7 +313,9 @@ impl Process {
 
     /// Returns whether other steps handle an end of the step with this number.
     pub(crate) fn handles(&self, number: usize, end: BadEnd) -> bool {
-        let conditions = self.steps.iter().flat_map(|step| &step.when).flatten();
+        let of_steps = self.steps.iter().flat_map(|step| &step.when);
+        let of_loops = self.loops.iter().flat_map(|one| &one.again);
+        let conditions = of_steps.chain(of_loops).flatten();
         let mut handlers = conditions.filter(|condition| !condition.is_negated);
         handlers.any(|condition| condition.step == number && condition.test == Test::Ended(end))
     }
@@ -354,6 +383,15 @@ impl Process {
             of_conditions(&step.when, step_iri, &iris, &mut say);
             of_step(step, step_iri, &iris, &mut say, type_iri);
         }
+        for (one, number) in self.loops.iter().zip(1..) {
+            let loop_iri = format!("{}/loop/{number}", self.iri);
+            say(&self.iri, v::HAS_LOOP, iri(&loop_iri));
+            for step in one.steps.iter().filter_map(|number| iris.get(*number)) {
+                say(&loop_iri, v::REPEATS, iri(step));
+            }
+            say(&loop_iri, v::ROUNDS, Object::Integer(one.rounds.into()));
+            of_conditions(&one.again, &loop_iri, &iris, &mut say);
+        }
         all
     }
 
@@ -373,17 +411,17 @@ impl Process {
     }
 }
 
-/// Adds the alternatives of a step to the graph.
+/// Adds the alternatives of a step or of a loop to the graph.
 fn of_conditions(
     when: &[Vec<Condition>],
-    step_iri: &str,
+    part_iri: &str,
     iris: &[String],
     say: &mut dyn FnMut(&str, &str, Object),
 ) {
     let iri = |iri: &str| Object::Iri(iri.to_owned());
     for (alternative, number) in when.iter().zip(1..) {
-        let alternative_iri = format!("{step_iri}/when/{number}");
-        say(step_iri, v::WHEN, iri(&alternative_iri));
+        let alternative_iri = format!("{part_iri}/when/{number}");
+        say(part_iri, v::WHEN, iri(&alternative_iri));
         for (condition, position) in alternative.iter().zip(1_i64..) {
             let condition_iri = format!("{alternative_iri}/{position}");
             say(&alternative_iri, v::CONDITION, iri(&condition_iri));

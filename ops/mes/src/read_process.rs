@@ -1,5 +1,7 @@
 //! Reads processes from the graph, which decides which processes run.
 
+mod loops;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
@@ -9,7 +11,7 @@ use skills::TypeName;
 
 use crate::locate_skill::numbers_of;
 use crate::process::{
-    BadEnd, By, Compare, Condition, Given, Job, Need, Process, ResultOf, Role, Step, Test,
+    BadEnd, By, Compare, Condition, Given, Job, Loop, Need, Process, ResultOf, Role, Step, Test,
 };
 
 /// The processes of the graph: each can run, or has a reason why it cannot.
@@ -30,7 +32,7 @@ impl Processes {
             answer.map_err(|fault| fault.to_string())
         };
         let (steps, parameters) = (ask("process-steps")?, ask("process-parameters")?);
-        let conditions = ask("process-conditions")?;
+        let (conditions, loops) = (ask("process-conditions")?, ask("process-loops")?);
         let mut by_process: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
         for row in &steps.rows {
             let process = Answer::text(row, "process");
@@ -41,6 +43,7 @@ impl Processes {
             let facts = Facts {
                 parameters: &parameters.rows,
                 conditions: &conditions.rows,
+                loops: &loops.rows,
             };
             match process(iri, &rows, facts) {
                 Ok(process) => processes.all.push(process),
@@ -56,6 +59,7 @@ impl Processes {
 struct Facts<'a> {
     parameters: &'a [Row],
     conditions: &'a [Row],
+    loops: &'a [Row],
 }
 
 fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String> {
@@ -112,26 +116,37 @@ fn process(iri: &str, rows: &[&Row], facts: Facts<'_>) -> Result<Process, String
         }
         steps.push(read);
     }
+    let loops = loops::loops_of(iri, (&order, &steps), (facts.loops, facts.conditions))?;
     if job.is_some() {
-        let has = |role: &Role| {
-            let mut needs = steps.iter().flat_map(|step: &Step| &step.needs);
-            needs.any(|need| need.role == *role)
-        };
-        if let Some(role) = Role::OF_COMPOSITE.iter().find(|role| !has(role)) {
-            return Err(format!(
-                "no step has a need with the ua:role `{}`",
-                role.name()
-            ));
-        }
+        is_composite(&steps, &loops)?;
     }
     Ok(Process {
         iri: iri.to_owned(),
         name: name.unwrap_or(iri).to_owned(),
         work: job.map_or(Job::Sequence, Job::PickAndPlace),
         steps,
+        loops,
         within,
         wait,
     })
+}
+
+/// Checks that a pick-and-place process has all roles, and no loop.
+fn is_composite(steps: &[Step], loops: &[Loop]) -> Result<(), String> {
+    if !loops.is_empty() {
+        return Err("it has a ua:hasLoop, and a pick-and-place process has none".to_owned());
+    }
+    let has = |role: &Role| {
+        let mut needs = steps.iter().flat_map(|step| &step.needs);
+        needs.any(|need| need.role == *role)
+    };
+    match Role::OF_COMPOSITE.iter().find(|role| !has(role)) {
+        None => Ok(()),
+        Some(role) => Err(format!(
+            "no step has a need with the ua:role `{}`",
+            role.name()
+        )),
+    }
 }
 
 /// The position of a step, its IRI and its rows.

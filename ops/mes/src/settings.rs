@@ -286,6 +286,7 @@ impl Reading<'_> {
             name: name?,
             work: work?,
             steps,
+            loops: Vec::new(),
             within: within?,
             wait: wait?,
         })

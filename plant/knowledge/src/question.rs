@@ -132,6 +132,10 @@ pub const QUESTIONS: &[Question] = &[
         sparql: include_str!("../queries/process-conditions.rq"),
     },
     Question {
+        name: "process-loops",
+        sparql: include_str!("../queries/process-loops.rq"),
+    },
+    Question {
         name: "process-parameters",
         sparql: include_str!("../queries/process-parameters.rq"),
     },

@@ -16,9 +16,12 @@ pub(super) struct Done {
     /// The skill of its compensation, if it has one.
     pub(super) undo: Option<Offer>,
     pub(super) results: Vec<(String, Value)>,
+    /// It was done in an earlier round of a loop, and the present round does it again.
+    pub(super) is_earlier: bool,
 }
 
 /// Returns the choices that later plans keep: those of completed steps and of their compensations.
+/// Steps that are done again are chosen again.
 pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<Kept> {
     let one = |done: &Done| {
         let undo = done.undo.clone().map(|offer| Kept {
@@ -31,7 +34,8 @@ pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<Kept> {
         };
         std::iter::once(step).chain(undo).collect::<Vec<_>>()
     };
-    done.iter().flat_map(one).collect()
+    let current = done.iter().filter(|done| !done.is_earlier);
+    current.flat_map(one).collect()
 }
 
 /// Returns the parameters of a step, with the results of completed steps in them.
@@ -41,7 +45,7 @@ pub(super) fn kept(process: &Process, done: &[Done]) -> Vec<Kept> {
 pub(super) fn resolved(
     plant: &dyn Plant,
     step: &Step,
-    done: &[Done],
+    done: &[&Done],
 ) -> Result<Vec<Given>, String> {
     let one = |given: &Given| {
         let Some(of) = &given.result else {
@@ -65,12 +69,19 @@ pub(super) fn resolved(
     step.parameters.iter().map(one).collect()
 }
 
-/// A completed step, its compensation, and the skill that runs the compensation.
-type Undone<'a> = (&'a Step, &'a Step, &'a Offer);
+/// A completed step to compensate.
+struct Undone<'a> {
+    step: &'a Step,
+    compensation: &'a Step,
+    /// The skill that runs the compensation.
+    offer: &'a Offer,
+    /// The completed steps up to this one: the results that the compensation may take.
+    until: &'a [Done],
+}
 
 /// Returns the names of the completed steps.
 fn names(steps: &[Undone<'_>]) -> String {
-    let names = steps.iter().map(|(step, ..)| format!("`{}`", step.name));
+    let names = steps.iter().map(|one| format!("`{}`", one.step.name));
     names.collect::<Vec<_>>().join(", ")
 }
 
@@ -80,10 +91,16 @@ impl Execution<'_> {
     /// Nothing is compensated after the caller stopped the run, and while the end of a skill is not
     /// confirmed: its machine may still move.
     pub(super) async fn compensated(&self, why: String, done: &[Done]) -> String {
-        let undone = done.iter().rev().filter_map(|done| {
+        let undone = (1..=done.len()).rev().filter_map(|count| {
+            let until = done.get(..count)?;
+            let done = until.last()?;
             let step = self.process.steps.get(done.number)?;
-            let compensation = step.compensation.as_deref()?;
-            Some((step, compensation, done.undo.as_ref()?))
+            Some(Undone {
+                step,
+                compensation: step.compensation.as_deref()?,
+                offer: done.undo.as_ref()?,
+                until,
+            })
         });
         let undone: Vec<Undone<'_>> = undone.collect();
         if undone.is_empty() {
@@ -100,7 +117,7 @@ impl Execution<'_> {
                 names(&undone)
             );
         }
-        let plan = Plan::of(undone.iter().map(|(_, step, offer)| (*step, *offer)));
+        let plan = Plan::of(undone.iter().map(|one| (one.compensation, one.offer)));
         self.log.change(|kept, now| {
             kept.run.waits_for = None;
             let number = kept.run.plans.len().saturating_add(1);
@@ -109,7 +126,7 @@ impl Execution<'_> {
                 ..Planned::begins(number, now, plan)
             });
         });
-        match self.undo_all(&undone, done).await {
+        match self.undo_all(&undone).await {
             Ok(()) => {
                 self.end(How::Done, None);
                 format!("{why}; compensated: {}", names(&undone))
@@ -130,26 +147,24 @@ impl Execution<'_> {
     async fn undo_all<'a>(
         &self,
         undone: &'a [Undone<'a>],
-        done: &[Done],
     ) -> Result<(), (String, &'a [Undone<'a>])> {
         let mut left = undone;
-        while let [(step, compensation, offer), rest @ ..] = left {
+        while let [one, rest @ ..] = left {
             left = rest;
-            if let Err(fault) = self.undo(compensation, offer, done).await {
-                warn!(
-                    step = step.name,
-                    "the compensation of a step failed: {fault}"
-                );
-                let reason = format!("the compensation of `{}` failed: {fault}", step.name);
+            let name = &one.step.name;
+            if let Err(fault) = self.undo(one).await {
+                warn!(step = name, "the compensation of a step failed: {fault}");
+                let reason = format!("the compensation of `{name}` failed: {fault}");
                 return Err((reason, left));
             }
-            info!(step = step.name, "a step is compensated");
+            info!(step = name, "a step is compensated");
         }
         Ok(())
     }
 
     /// Runs the skill of a compensation.
-    async fn undo(&self, step: &Step, offer: &Offer, done: &[Done]) -> Result<(), String> {
+    async fn undo(&self, undone: &Undone<'_>) -> Result<(), String> {
+        let (step, offer) = (undone.compensation, undone.offer);
         self.teller.step("Compensate").await;
         let opened = self.open(std::slice::from_ref(offer)).await;
         let (opened, skills) = opened.map_err(|fault| {
@@ -157,10 +172,13 @@ impl Execution<'_> {
             format!("{name} cannot be reached: {}", fault.why)
         })?;
         let ended = match skills.first() {
-            Some(skill) => match self.prepared(step, offer, done) {
-                Ok(values) => self.one(step, (offer, &**skill), values).await,
-                Err(end) => end,
-            },
+            // The results of the same round are the latest before it.
+            Some(skill) => {
+                match self.prepared(step, offer, &undone.until.iter().rev().collect::<Vec<_>>()) {
+                    Ok(values) => self.one(step, (offer, &**skill), values).await,
+                    Err(end) => end,
+                }
+            }
             None => StepEnd::Failed("its skill is gone".to_owned()),
         };
         close(opened).await;

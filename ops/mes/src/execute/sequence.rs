@@ -1,5 +1,6 @@
 //! The steps of a sequence: each begins when the steps that it waits for are over, and its
-//! conditions hold. Steps that do not wait for each other run in parallel.
+//! conditions hold. Steps that do not wait for each other run in parallel. The steps of a loop are
+//! done again, by a plan of their own, while its conditions hold.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -10,7 +11,7 @@ use tracing::info;
 
 use super::compensate::{self, Done};
 use super::{Chosen, Ended, Execution, Fallen, Offer, Role, Step};
-use crate::process::{BadEnd, Condition, Process, Test};
+use crate::process::{BadEnd, Condition, Loop, Process, Test};
 
 /// The steps of a run that are over.
 #[derive(Debug, Default)]
@@ -19,6 +20,10 @@ pub(super) struct Progress {
     pub(super) done: Vec<Done>,
     /// The other steps, by their numbers.
     pub(super) passed: BTreeMap<usize, Passed>,
+    /// The completed rounds of loops whose steps are done again, by the numbers of the loops.
+    rounds: BTreeMap<usize, u32>,
+    /// The loops after their last round.
+    left: BTreeSet<usize>,
 }
 
 /// The reason why the process goes on behind a step that is not done.
@@ -32,18 +37,97 @@ pub(super) enum Passed {
 
 impl Progress {
     pub(super) fn is_over(&self, number: usize) -> bool {
-        self.passed.contains_key(&number) || self.done.iter().any(|done| done.number == number)
+        self.passed.contains_key(&number) || self.current().any(|done| done.number == number)
     }
 
-    /// Returns whether one of the alternatives of a step holds.
+    /// Returns whether all steps are over, in the last round of each loop.
+    fn is_complete(&self, process: &Process) -> bool {
+        let mut steps = 0..process.steps.len();
+        let mut loops = 0..process.loops.len();
+        steps.all(|step| self.is_over(step)) && loops.all(|number| self.left.contains(&number))
+    }
+
+    /// Returns the completed steps, without those of earlier rounds.
+    fn current(&self) -> impl Iterator<Item = &Done> {
+        self.done.iter().filter(|done| !done.is_earlier)
+    }
+
+    /// Returns whether a step need not wait for another step any longer: the other step is over,
+    /// and no other round does it again.
+    fn is_behind(&self, process: &Process, (step, other): (usize, usize)) -> bool {
+        let mut loops = process.loops.iter().enumerate();
+        let is_last = |(number, one): (usize, &Loop)| {
+            let is_outside = one.steps.contains(&other) && !one.steps.contains(&step);
+            !is_outside || self.left.contains(&number)
+        };
+        self.is_over(other) && loops.all(is_last)
+    }
+
+    /// Begins the next round of a loop whose steps are over, if one is due. Returns whether it did.
+    ///
+    /// # Errors
+    /// The condition that cannot be decided, or the maximum number of rounds.
+    fn next_round(&mut self, process: &Process) -> Result<bool, String> {
+        loop {
+            let mut loops = process.loops.iter().enumerate();
+            let over = loops.find(|(number, one)| {
+                let is_inner = |(_, other): &(usize, &Loop)| other.is_within(one);
+                let mut inner = process.loops.iter().enumerate().filter(is_inner);
+                !self.left.contains(number)
+                    && one.steps.iter().all(|step| self.is_over(*step))
+                    && inner.all(|(inner, _)| self.left.contains(&inner))
+            });
+            let Some((number, over)) = over else {
+                return Ok(false);
+            };
+            let first = over.steps.first().and_then(|step| process.steps.get(*step));
+            let name = first.map_or("", |step| step.name.as_str());
+            let is_due = self.holds_one(process, &over.again);
+            if !is_due.map_err(|why| format!("the loop of `{name}`: {why}"))? {
+                self.left.insert(number);
+                continue;
+            }
+            let rounds = self.rounds.entry(number).or_default();
+            *rounds = rounds.saturating_add(1);
+            if *rounds >= over.rounds {
+                return Err(format!(
+                    "the loop of `{name}` has had {rounds} rounds, its maximum, and another one is due"
+                ));
+            }
+            info!(step = name, rounds, "another round of a loop begins");
+            self.repeat(process, over);
+            return Ok(true);
+        }
+    }
+
+    /// Makes the steps of a loop, and the loops within it, begin again.
+    fn repeat(&mut self, process: &Process, over: &Loop) {
+        for done in &mut self.done {
+            done.is_earlier |= over.steps.contains(&done.number);
+        }
+        self.passed.retain(|step, _| !over.steps.contains(step));
+        for (number, inner) in process.loops.iter().enumerate() {
+            if inner.is_within(over) {
+                self.left.remove(&number);
+                self.rounds.remove(&number);
+            }
+        }
+    }
+
+    /// Returns whether a step is not skipped: it has no alternatives, or one of them holds.
     ///
     /// # Errors
     /// The condition that cannot be decided.
     fn allows(&self, process: &Process, step: &Step) -> Result<bool, String> {
-        if step.when.is_empty() {
-            return Ok(true);
+        match step.when.is_empty() {
+            true => Ok(true),
+            false => self.holds_one(process, &step.when),
         }
-        for alternative in &step.when {
+    }
+
+    /// Returns whether all conditions of one of the alternatives hold.
+    fn holds_one(&self, process: &Process, all: &[Vec<Condition>]) -> Result<bool, String> {
+        for alternative in all {
             let mut holds = true;
             // The conditions of an outer branch come first: an inner condition is not decidable
             // when its branch was not taken.
@@ -70,8 +154,7 @@ impl Progress {
             } => {
                 let of = process.steps.get(condition.step);
                 let of = of.map_or("", |step| step.name.as_str());
-                let mut done = self.done.iter();
-                let done = done.find(|done| done.number == condition.step);
+                let done = self.current().find(|done| done.number == condition.step);
                 let done = done.ok_or_else(|| format!("`{of}` is not done, and has no {name}"))?;
                 let mut results = done.results.iter();
                 let result = results.find(|(known, _)| known == name);
@@ -119,11 +202,11 @@ impl Execution<'_> {
         let mut ended = Ended::Done;
         loop {
             while matches!(ended, Ended::Done) && !*self.paused.borrow() {
-                let (number, place) = match self.ready(chosen, &begun, &mut *progress) {
+                let (number, place) = match self.next(chosen, &begun, &mut *progress) {
                     Ok(Some(ready)) => ready,
                     Ok(None) => break,
-                    Err(why) => {
-                        ended = Ended::Over(why);
+                    Err(end) => {
+                        ended = end;
                         break;
                     }
                 };
@@ -136,7 +219,7 @@ impl Execution<'_> {
                     break;
                 };
                 begun.insert(number, &offer.component);
-                match self.prepared(step, offer, &progress.done) {
+                match self.prepared(step, offer, &progress.current().collect::<Vec<_>>()) {
                     Ok(values) => running.push(async move {
                         self.teller.step("Step").await;
                         let end = self.one(step, (offer, &**skill), values).await;
@@ -148,8 +231,7 @@ impl Execution<'_> {
                     }
                 }
             }
-            let mut steps = 0..self.process.steps.len();
-            let is_left = steps.any(|number| !progress.is_over(number));
+            let is_left = !progress.is_complete(self.process);
             let is_paused = *self.paused.borrow() && matches!(ended, Ended::Done) && is_left;
             let next = match is_paused {
                 false => running.next().await,
@@ -170,8 +252,7 @@ impl Execution<'_> {
             begun.remove(&number);
             self.over((number, offer), end, (chosen, &mut *progress), &mut ended);
         }
-        let mut left = 0..self.process.steps.len();
-        if matches!(ended, Ended::Done) && left.any(|number| !progress.is_over(number)) {
+        if matches!(ended, Ended::Done) && !progress.is_complete(self.process) {
             return Ended::Over("steps of the process wait for each other".to_owned());
         }
         ended
@@ -186,6 +267,30 @@ impl Execution<'_> {
         }
     }
 
+    /// Returns a step that can begin.
+    ///
+    /// # Errors
+    /// The end of the plan: another round of a loop, or the reason why the process cannot go on.
+    fn next(
+        &self,
+        chosen: &Chosen,
+        begun: &BTreeMap<usize, &str>,
+        progress: &mut Progress,
+    ) -> Result<Option<Ready>, Ended> {
+        loop {
+            if progress.next_round(self.process).map_err(Ended::Over)? {
+                return Err(Ended::Round);
+            }
+            let skipped = progress.passed.len();
+            let ready = self.ready(chosen, begun, progress);
+            let ready = ready.map_err(Ended::Over)?;
+            // A skipped step may be the last one of its round.
+            if ready.is_some() || progress.passed.len() == skipped {
+                return Ok(ready);
+            }
+        }
+    }
+
     /// Returns a step that can begin. Steps whose conditions do not hold are skipped. A component
     /// does one step at a time.
     fn ready(
@@ -197,7 +302,7 @@ impl Execution<'_> {
         let busy: BTreeSet<&str> = begun.values().copied().collect();
         for (number, step) in self.process.steps.iter().enumerate() {
             let mut waits = step.waits_for(number).into_iter();
-            let is_waiting = waits.any(|other| !progress.is_over(other));
+            let is_waiting = waits.any(|other| !progress.is_behind(self.process, (number, other)));
             if progress.is_over(number) || begun.contains_key(&number) || is_waiting {
                 continue;
             }
@@ -242,6 +347,7 @@ impl Execution<'_> {
                     offer: offer.clone(),
                     undo: chosen.undo.get(&number).cloned(),
                     results,
+                    is_earlier: false,
                 });
                 return;
             }
@@ -273,7 +379,7 @@ impl Execution<'_> {
         &self,
         step: &Step,
         offer: &Offer,
-        done: &[Done],
+        done: &[&Done],
     ) -> Result<Vec<(String, Value)>, StepEnd> {
         let given = compensate::resolved(self.plant, step, done)
             .map_err(|why| StepEnd::Unresolved(format!("{}: {why}", step.name)))?;
@@ -336,8 +442,8 @@ impl Ended {
     /// Adds the end of another step. No other plan can do the work if it cannot for one of them.
     fn and(&mut self, other: Self) {
         *self = match (std::mem::replace(self, Self::Done), other) {
-            (Self::Done, other) => other,
-            (before, Self::Done) => before,
+            (Self::Done | Self::Round, other) => other,
+            (before, Self::Done | Self::Round) => before,
             (Self::Broken(one), Self::Broken(two)) => Self::Broken(format!("{one}; {two}")),
             // All running steps are stopped together.
             (Self::Over(one), Self::Over(two)) if one == two => Self::Over(one),

@@ -1,4 +1,5 @@
 mod flow;
+mod loops;
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -132,6 +133,20 @@ impl Opened for FakeOpened {
     }
 }
 
+impl FakeSkill {
+    /// Returns the results of a run: `Count` has its number.
+    fn results(&self, name: &str) -> Vec<(String, Value)> {
+        let journal = self.plant.journal.lock().unwrap();
+        let runs = journal.iter().filter(|told| **told == name).count();
+        let runs = Value::Double(f64::from(u32::try_from(runs).unwrap()));
+        match name.rsplit('.').next() {
+            Some("Grasp") => vec![("Width".to_owned(), Value::Double(0.03))],
+            Some("Count") => vec![("Runs".to_owned(), runs)],
+            _ => vec![],
+        }
+    }
+}
+
 #[async_trait]
 impl Runs for FakeSkill {
     fn name(&self) -> String {
@@ -211,14 +226,12 @@ impl Runs for FakeSkill {
                 None => std::future::pending().await,
             };
         }
-        let width = ("Width".to_owned(), Value::Double(0.03));
-        let results = name.ends_with(".Grasp").then_some(width);
         Ok(Outcome {
             run: 1,
             succeeded: true,
             unknown: false,
             message: String::new(),
-            results: results.into_iter().collect(),
+            results: self.results(&name),
             trace: vec![],
         })
     }
@@ -339,6 +352,7 @@ fn process() -> Process {
             shape: None,
         }),
         steps: vec![step("pick", Role::Grasp), step("place", Role::Release)],
+        loops: vec![],
         within: Duration::from_secs(5),
         wait: Duration::from_millis(300),
     }

@@ -165,6 +165,7 @@ fn process() -> Process {
             step("pick", need(Role::Grasp, GRASP)),
             step("place", need(Role::Release, RELEASE)),
         ],
+        loops: vec![],
         within: Duration::from_secs(30),
         wait: Duration::from_secs(30),
     }

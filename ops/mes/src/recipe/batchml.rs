@@ -2,8 +2,8 @@
 //!
 //! Steps and transitions have the meaning of a sequential function chart: a transition with several
 //! steps before it waits for all of them, and a step with several transitions behind it takes the
-//! first whose condition holds. Recipe elements with a procedure logic of their own are replaced by
-//! it; the others are steps.
+//! first whose condition holds. A transition that leads to an earlier step is a loop. Recipe
+//! elements with a procedure logic of their own are replaced by it; the others are steps.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,7 @@ use mtp::escaped;
 use roxmltree::Node;
 use serde_json::Value;
 
-use super::flow::{Edge, Flow, MOST_FLOW_NODES, NodeCondition, NodeKind, too_large};
+use super::flow::{Edge, Flow, MOST_FLOW_NODES, NodeCondition, NodeKind, Sequence, too_large};
 use super::values::{self, Written};
 use super::{Reading, child, children, text_of};
 use crate::process::{Given, Job, Need, Process, ResultOf, Role, Step};
@@ -105,7 +105,7 @@ impl<'d> Reading<'d> {
             .flow
             .edge(start, first, recipe.range().start, Vec::new());
         let flow = self.resolved(parts);
-        let steps = self.steps(&flow)?;
+        let Sequence { steps, loops } = self.sequence(&flow)?;
         let description = text_of(recipe, "Description");
         Some(Process {
             iri: self.iri(id, "recipe"),
@@ -117,6 +117,7 @@ impl<'d> Reading<'d> {
             .to_owned(),
             work: Job::Sequence,
             steps,
+            loops,
             within: USUALLY_WITHIN,
             wait: USUALLY_WAIT,
         })
@@ -186,9 +187,14 @@ impl<'d> Reading<'d> {
             .collect();
         // A step to which no link leads would begin at once: only one step does.
         let starts = places.values().map(|ends| ends.0);
-        let starts: Vec<usize> = starts
+        let mut starts: Vec<usize> = starts
             .filter(|start| !inside.iter().any(|(_, to)| to == start))
             .collect();
+        if starts.is_empty() {
+            // A loop may return to the first step, which is the first one of the file.
+            let steps = places.iter().filter(|((kind, _), _)| *kind == "Step");
+            starts.extend(steps.map(|(_, ends)| ends.0).min());
+        }
         if starts.len() > 1 {
             let names = starts.iter().filter_map(|node| parts.flow.nodes.get(*node));
             let names: Vec<&str> = names.map(|node| node.name.as_str()).collect();

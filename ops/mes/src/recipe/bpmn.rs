@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use roxmltree::Node;
 
-use super::flow::{self, Flow, NodeCondition, NodeKind};
+use super::flow::{self, Flow, NodeCondition, NodeKind, Sequence};
 use super::values::{self, Written};
 use super::{Reading, child, children, text_of};
 use crate::process::{BadEnd, Given, Job, Process, ResultOf, Step, Test};
@@ -83,12 +83,13 @@ impl<'d> Reading<'d> {
         if self.errors.len() > before {
             return None;
         }
-        let steps = self.steps(&parts.flow)?;
+        let Sequence { steps, loops } = self.sequence(&parts.flow)?;
         Some(Process {
             iri: self.iri(id, "bpmn"),
             name: process.attribute("name").unwrap_or(id).to_owned(),
             work: Job::Sequence,
             steps,
+            loops,
             within: USUALLY_WITHIN,
             wait: USUALLY_WAIT,
         })
@@ -198,7 +199,9 @@ impl<'d> Reading<'d> {
             if kind.ends_with("LoopCharacteristics") {
                 self.error(
                     loops,
-                    format!("{kind} of `{name}` is not supported; loops are not"),
+                    format!(
+                        "{kind} of `{name}` is not supported; return to it by an exclusive gateway"
+                    ),
                 );
             }
         }

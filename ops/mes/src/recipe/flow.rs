@@ -2,13 +2,17 @@
 //!
 //! Each node has a guard: the alternatives under which it is reached, each a list of conditions. A
 //! node where branches meet again has a shorter guard than its branches, since a condition and its
-//! negation cancel.
+//! negation cancel. A flow that returns makes a loop of the nodes between: its steps are done again
+//! while the guard of the returning flow holds.
+
+mod loops;
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::Reading;
-use crate::process::{BadEnd, Condition, Role, Step, Test};
+use crate::process::{BadEnd, Condition, Loop, Role, Step, Test};
 use crate::read_process::MOST_STEPS;
+use loops::FlowLoops;
 
 /// The nodes of a process, and the flows between them.
 #[derive(Debug, Default)]
@@ -55,6 +59,21 @@ pub(super) type NodeCondition = Condition;
 /// Alternatives, each of which is a list of conditions.
 type Guard = Vec<Vec<NodeCondition>>;
 
+/// The steps of a process in an order in which they can be done, and its loops.
+#[derive(Debug)]
+pub(super) struct Sequence {
+    pub(super) steps: Vec<Step>,
+    pub(super) loops: Vec<Loop>,
+}
+
+/// What is known about each node, by its number.
+#[derive(Debug)]
+struct Paths {
+    guards: Vec<Guard>,
+    /// The steps that it waits for.
+    after: Vec<BTreeSet<usize>>,
+}
+
 impl Flow {
     /// Adds a node. Returns its number.
     pub(super) fn node(&mut self, at: usize, name: &str, kind: NodeKind) -> usize {
@@ -83,6 +102,10 @@ impl Flow {
         all
     }
 
+    fn name(&self, node: usize) -> &str {
+        self.nodes.get(node).map_or("", |node| node.name.as_str())
+    }
+
     fn is_task(&self, node: usize) -> bool {
         let node = self.nodes.get(node);
         node.is_some_and(|node| matches!(node.kind, NodeKind::Task(_)))
@@ -107,34 +130,38 @@ pub(super) fn ended_well(step: usize, handled: &[BadEnd]) -> Vec<NodeCondition> 
 }
 
 impl Reading<'_> {
-    /// Returns the steps of a flow in an order in which they can be done.
-    pub(super) fn steps(&mut self, flow: &Flow) -> Option<Vec<Step>> {
+    /// Returns the steps of a flow in an order in which they can be done, and its loops.
+    pub(super) fn sequence(&mut self, flow: &Flow) -> Option<Sequence> {
         let before = self.errors.len();
         if flow.nodes.len() > MOST_FLOW_NODES {
             let at = flow.nodes.first().map_or(0, |node| node.at);
             self.error_at(at, too_large());
             return None;
         }
-        let order = self.ordered(flow)?;
-        let mut guards: Vec<Guard> = flow.nodes.iter().map(|_| Guard::new()).collect();
-        let mut after: Vec<BTreeSet<usize>> = flow.nodes.iter().map(|_| BTreeSet::new()).collect();
+        let loops = match FlowLoops::of(flow) {
+            Ok(loops) => loops,
+            Err((at, what)) => {
+                self.error_at(at, what);
+                return None;
+            }
+        };
+        let order = self.ordered(flow, &loops)?;
+        let mut paths = Paths {
+            guards: flow.nodes.iter().map(|_| Guard::new()).collect(),
+            after: flow.nodes.iter().map(|_| BTreeSet::new()).collect(),
+        };
         for node in &order {
-            let (guard, waits) = self.reached(flow, *node, &guards, &after)?;
-            if let Some(place) = guards.get_mut(*node) {
+            let (guard, waits) = self.reached((flow, &loops), *node, &paths)?;
+            if let Some(place) = paths.guards.get_mut(*node) {
                 *place = guard;
             }
-            if let Some(place) = after.get_mut(*node) {
+            if let Some(place) = paths.after.get_mut(*node) {
                 *place = waits;
             }
         }
         let tasks: Vec<usize> = order
             .into_iter()
             .filter(|node| flow.is_task(*node))
-            .collect();
-        let numbers: BTreeMap<usize, usize> = tasks
-            .iter()
-            .enumerate()
-            .map(|(number, node)| (*node, number))
             .collect();
         if tasks.is_empty() || tasks.len() > MOST_STEPS {
             let at = flow.nodes.first().map_or(0, |node| node.at);
@@ -143,6 +170,25 @@ impl Reading<'_> {
             self.error_at(at, what);
             return None;
         }
+        let numbers: BTreeMap<usize, usize> = tasks
+            .iter()
+            .enumerate()
+            .map(|(number, node)| (*node, number))
+            .collect();
+        let steps = self.steps(flow, &tasks, &paths, &numbers);
+        let loops = self.loops((flow, &loops), &paths, &numbers);
+        (self.errors.len() == before).then_some(Sequence { steps, loops })
+    }
+
+    /// Returns the steps of tasks in their order, with the numbers of steps in the place of those
+    /// of nodes.
+    fn steps(
+        &mut self,
+        flow: &Flow,
+        tasks: &[usize],
+        paths: &Paths,
+        numbers: &BTreeMap<usize, usize>,
+    ) -> Vec<Step> {
         let mut steps = Vec::new();
         for (number, node) in tasks.iter().enumerate() {
             let Some(FlowNode {
@@ -154,11 +200,11 @@ impl Reading<'_> {
                 continue;
             };
             let mut step = (**step).clone();
-            let guard = guards.get(*node).cloned().unwrap_or_default();
+            let guard = paths.guards.get(*node).cloned().unwrap_or_default();
             for need in &mut step.needs {
                 need.role = Role::Alone(number);
             }
-            self.results(&mut step, (*at, &guard), flow, (&guards, &numbers));
+            self.results(&mut step, (*at, &guard), flow, (&paths.guards, numbers));
             let is_always = guard.iter().any(Vec::is_empty);
             step.when = if is_always { Vec::new() } else { guard };
             for condition in step.when.iter_mut().flatten() {
@@ -170,7 +216,7 @@ impl Reading<'_> {
                     }
                 }
             }
-            let waits = after.get(*node).into_iter().flatten();
+            let waits = paths.after.get(*node).into_iter().flatten();
             let waits: BTreeSet<usize> = waits
                 .filter_map(|other| numbers.get(other))
                 .copied()
@@ -182,7 +228,68 @@ impl Reading<'_> {
             step.after = (!is_next).then(|| waits.into_iter().collect());
             steps.push(step);
         }
-        (self.errors.len() == before).then_some(steps)
+        steps
+    }
+
+    /// Returns the loops over the steps with these numbers.
+    fn loops(
+        &mut self,
+        (flow, loops): (&Flow, &FlowLoops),
+        paths: &Paths,
+        numbers: &BTreeMap<usize, usize>,
+    ) -> Vec<Loop> {
+        let guarded = |edge: &Edge| {
+            let guard = paths.guards.get(edge.from);
+            guard.map_or_else(Guard::new, |guard| and(guard, &edge.when))
+        };
+        let mut all = Vec::new();
+        for one in &loops.all {
+            let name = flow.name(one.head);
+            let at = loops.back(flow, one.head).next().map_or(0, |edge| edge.at);
+            let mut again = simplified(loops.back(flow, one.head).flat_map(guarded).collect());
+            let ways = loops.forward(flow).filter(|edge| one.is_left_by(edge));
+            let ways: Vec<&Edge> = ways.collect();
+            let is_left = !ways.is_empty();
+            // The condition of a way may come behind a transition.
+            let unclear = loops.way_with(flow, ways, |edge| !excludes(&guarded(edge), &again));
+            let steps: BTreeSet<usize> = one
+                .nodes
+                .iter()
+                .filter_map(|node| numbers.get(node))
+                .copied()
+                .collect();
+            if steps.is_empty() || !is_left || again.len() > MOST_ALTERNATIVES {
+                let what = match (steps.is_empty(), is_left) {
+                    (true, _) => format!("the loop that returns to `{name}` has no step"),
+                    (_, false) => format!("no way leads out of the loop that returns to `{name}`"),
+                    _ => format!(
+                        "the flow returns to `{name}` in more than {MOST_ALTERNATIVES} ways"
+                    ),
+                };
+                self.error_at(at, what);
+                continue;
+            }
+            if let Some(edge) = unclear {
+                let what = format!(
+                    "the flow leaves the loop that returns to `{name}` while it returns; only one \
+                     of their conditions may hold"
+                );
+                self.error_at(edge.at, what);
+                continue;
+            }
+            for condition in again.iter_mut().flatten() {
+                match numbers.get(&condition.step) {
+                    Some(step) => condition.step = *step,
+                    None => self.error_at(at, "a condition names no step".to_owned()),
+                }
+            }
+            all.push(Loop {
+                steps,
+                again,
+                rounds: Loop::USUAL_ROUNDS,
+            });
+        }
+        all
     }
 
     /// Resolves the steps whose results are parameters: they are done whenever the step is reached.
@@ -222,9 +329,9 @@ impl Reading<'_> {
 
     /// Returns the nodes in an order in which each comes after those that lead to it. Nodes of one
     /// rank have the order of the file.
-    fn ordered(&mut self, flow: &Flow) -> Option<Vec<usize>> {
+    fn ordered(&mut self, flow: &Flow, loops: &FlowLoops) -> Option<Vec<usize>> {
         let mut open: Vec<usize> = flow.nodes.iter().map(|_| 0).collect();
-        for edge in &flow.edges {
+        for edge in loops.forward(flow) {
             if let Some(count) = open.get_mut(edge.to) {
                 *count += 1;
             }
@@ -243,7 +350,7 @@ impl Reading<'_> {
         let mut order = Vec::new();
         while let Some(node) = ready.pop_first() {
             order.push(node);
-            for edge in flow.edges.iter().filter(|edge| edge.from == node) {
+            for edge in loops.forward(flow).filter(|edge| edge.from == node) {
                 if let Some(count) = open.get_mut(edge.to) {
                     *count -= 1;
                     if *count == 0 {
@@ -255,15 +362,10 @@ impl Reading<'_> {
         if order.len() == flow.nodes.len() {
             return Some(order);
         }
-        let mut edges = flow.edges.iter();
-        let back = edges.find(|edge| !order.contains(&edge.to) && !order.contains(&edge.from));
-        if let Some(edge) = back {
-            let to = flow
-                .nodes
-                .get(edge.to)
-                .map_or("", |node| node.name.as_str());
-            let what = format!("the flow returns to `{to}`; loops are not supported");
-            self.error_at(edge.at, what);
+        let mut nodes = flow.nodes.iter().enumerate();
+        if let Some((_, node)) = nodes.find(|(number, _)| !order.contains(number)) {
+            let what = format!("`{}` is not reached from the start", node.name);
+            self.error_at(node.at, what);
         }
         None
     }
@@ -271,10 +373,9 @@ impl Reading<'_> {
     /// Returns the guard of a node, and the steps that it waits for.
     fn reached(
         &mut self,
-        flow: &Flow,
+        (flow, loops): (&Flow, &FlowLoops),
         node: usize,
-        guards: &[Guard],
-        after: &[BTreeSet<usize>],
+        paths: &Paths,
     ) -> Option<(Guard, BTreeSet<usize>)> {
         let here = flow.nodes.get(node)?;
         if matches!(here.kind, NodeKind::Start) {
@@ -282,11 +383,15 @@ impl Reading<'_> {
         }
         let mut waits = BTreeSet::new();
         let mut incoming: Vec<Guard> = Vec::new();
-        for edge in flow.edges.iter().filter(|edge| edge.to == node) {
-            incoming.push(and(guards.get(edge.from)?, &edge.when));
+        for edge in loops.forward(flow).filter(|edge| edge.to == node) {
+            incoming.push(and(paths.guards.get(edge.from)?, &edge.when));
             match flow.is_task(edge.from) {
                 true => drop(waits.insert(edge.from)),
-                false => waits.extend(after.get(edge.from)?),
+                false => waits.extend(paths.after.get(edge.from)?),
+            }
+            // The last round is over when all steps of the loop are.
+            for one in loops.left_by(edge) {
+                waits.extend(one.nodes.iter().filter(|node| flow.is_task(**node)));
             }
         }
         let guard = match here.kind {

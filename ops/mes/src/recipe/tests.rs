@@ -1,3 +1,5 @@
+mod loops;
+
 use std::time::Duration;
 
 use serde_json::json;
@@ -260,7 +262,7 @@ fn everything_unsupported_in_bpmn_is_refused_by_name_with_its_line() {
     <bpmn:sequenceFlow id="f12""#,
             r#"targetRef="dose"/>
     <bpmn:sequenceFlow id="f12""#,
-            "loops are not supported",
+            "the loop that returns to `dose` is entered at another place too",
         ),
         (
             r#"implementation="urn:example:capability:stir""#,

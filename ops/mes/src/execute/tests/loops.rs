@@ -1,0 +1,166 @@
+//! Steps that are done in rounds.
+
+use super::*;
+use crate::process::{BadEnd, By, Compare, Condition, Loop, Test};
+
+/// A loop over steps, which is repeated while a condition about one of them holds.
+fn repeated(steps: &[usize], (step, test): (usize, Test), rounds: u32) -> Loop {
+    Loop {
+        steps: steps.iter().copied().collect(),
+        again: vec![vec![Condition {
+            step,
+            test,
+            is_negated: false,
+        }]],
+        rounds,
+    }
+}
+
+fn runs_below(most: u32) -> Test {
+    Test::Result {
+        name: "Runs".into(),
+        compare: Compare::Less,
+        value: most.into(),
+    }
+}
+
+/// Counts its runs, stirs, and ends.
+fn counted(rounds: Loop) -> Process {
+    Process {
+        work: Job::Sequence,
+        steps: vec![
+            alone(0, "count", "CountType"),
+            alone(1, "stir", "StirType"),
+            alone(2, "end", "EndType"),
+        ],
+        loops: vec![rounds],
+        ..process()
+    }
+}
+
+fn vessels() -> Fakes {
+    plant(vec![
+        offer("one", "Count", "CountType"),
+        offer("two", "Stir", "StirType"),
+        offer("three", "End", "EndType"),
+    ])
+}
+
+fn ran(fakes: &Fakes) -> Vec<String> {
+    let mut journal = fakes.journal.lock().unwrap().clone();
+    journal.retain(|line| line != "closed");
+    journal
+}
+
+#[tokio::test]
+async fn the_steps_of_a_loop_are_repeated_while_its_condition_holds() {
+    let process = counted(repeated(&[0, 1], (0, runs_below(3)), 10));
+    let (run, fakes, _) = executed(vessels(), &process).await;
+    assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+    let round = ["one.Count", "two.Stir"];
+    let expected = [&round[..], &round, &round, &["three.End"]].concat();
+    assert_eq!(ran(&fakes), expected);
+    // Each round is a plan, whose end is in the record.
+    assert_eq!(run.plans.len(), 3, "{run:?}");
+    assert!(run.plans.iter().all(|plan| plan.outcome == How::Done));
+}
+
+#[tokio::test]
+async fn a_loop_ends_the_run_after_its_maximum_of_rounds() {
+    let process = counted(repeated(&[0, 1], (0, runs_below(3)), 2));
+    let (run, fakes, _) = executed(vessels(), &process).await;
+    assert_eq!(run.outcome, How::Failed);
+    let why = run.reason.unwrap();
+    assert!(
+        why.contains("the loop of `count` has had 2 rounds"),
+        "{why}"
+    );
+    assert_eq!(ran(&fakes).len(), 4);
+    // A condition that cannot be decided begins no round.
+    let unknown = Test::Result {
+        name: "Mass".into(),
+        compare: Compare::Less,
+        value: 3.into(),
+    };
+    let process = counted(repeated(&[0, 1], (0, unknown), 10));
+    let (run, fakes, _) = executed(vessels(), &process).await;
+    let why = run.reason.unwrap();
+    assert!(why.contains("`count` returned no result Mass"), "{why}");
+    assert_eq!(ran(&fakes), ["one.Count", "two.Stir"]);
+}
+
+#[tokio::test]
+async fn a_step_that_fails_is_tried_again_by_the_same_component() {
+    let mut fakes = vessels();
+    fakes.fails_at = Some("two.Stir");
+    let process = counted(repeated(&[1], (1, Test::Ended(BadEnd::Failed)), 3));
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!(run.outcome, How::Failed);
+    assert_eq!(
+        ran(&fakes),
+        ["one.Count", "two.Stir", "two.Stir", "two.Stir"]
+    );
+    // An end that is not confirmed begins no round: the machine may move.
+    let mut fakes = vessels();
+    fakes.ends = Some(("two.Stir", Some(Ok(unconfirmed("no answer")))));
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!(run.outcome, How::Unknown, "{run:?}");
+    assert_eq!(ran(&fakes), ["one.Count", "two.Stir"]);
+}
+
+#[tokio::test]
+async fn an_inner_loop_begins_anew_in_each_round_of_the_outer_one() {
+    // The inner loop stirs twice; the outer one counts to two.
+    let mut process = counted(repeated(&[0, 1], (0, runs_below(2)), 10));
+    process.steps[1] = alone(1, "stir", "OtherCountType");
+    let odd = [1, 3].map(|runs| {
+        vec![Condition {
+            step: 1,
+            test: Test::Result {
+                name: "Runs".into(),
+                compare: Compare::Equal,
+                value: runs.into(),
+            },
+            is_negated: false,
+        }]
+    });
+    process.loops.push(Loop {
+        steps: [1].into(),
+        again: odd.into(),
+        // The number of rounds in each round of the outer loop.
+        rounds: 2,
+    });
+    let fakes = plant(vec![
+        offer("one", "Count", "CountType"),
+        offer("two", "Count", "OtherCountType"),
+        offer("three", "End", "EndType"),
+    ]);
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!((run.outcome, &run.reason), (How::Done, &None));
+    let round = ["one.Count", "two.Count", "two.Count"];
+    assert_eq!(
+        ran(&fakes),
+        [&round[..], &round, &["three.End"]].concat(),
+        "{run:?}"
+    );
+}
+
+#[tokio::test]
+async fn each_round_of_a_loop_is_compensated() {
+    let mut fakes = vessels();
+    let undo = offer("one", "Undo", "UndoType");
+    fakes.offers.lock().unwrap().push(undo);
+    fakes.fails_at = Some("three.End");
+    let mut process = counted(repeated(&[0], (0, runs_below(2)), 10));
+    process.steps[0].compensation = Some(Box::new(Step {
+        by: By::SameAs(0),
+        ..alone(3, "undo", "UndoType")
+    }));
+    let (run, fakes, _) = executed(fakes, &process).await;
+    assert_eq!(run.outcome, How::Failed);
+    let why = run.reason.unwrap();
+    assert!(why.ends_with("compensated: `count`, `count`"), "{why}");
+    let ran = ran(&fakes);
+    assert_eq!(ran[..2], ["one.Count", "one.Count"]);
+    assert_eq!(ran[ran.len() - 2..], ["one.Undo", "one.Undo"]);
+}

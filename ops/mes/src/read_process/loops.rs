@@ -1,0 +1,104 @@
+//! Reads the loops of processes from the graph.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use knowledge::Answer;
+use serde_json::Value;
+
+use super::{Row, conditions_of, one};
+use crate::process::{Loop, Step};
+
+/// Reads the loops of a process. `order` has the IRIs of the steps.
+///
+/// # Errors
+/// The reason why the process cannot run.
+pub(super) fn loops_of(
+    process: &str,
+    (order, steps): (&[&str], &[Step]),
+    (loops, conditions): (&[Row], &[Row]),
+) -> Result<Vec<Loop>, String> {
+    let mut by_loop: BTreeMap<&str, Vec<&Row>> = BTreeMap::new();
+    let of_process = |row: &&Row| Answer::text(row, "process") == process;
+    for row in loops.iter().filter(of_process) {
+        by_loop
+            .entry(Answer::text(row, "loop"))
+            .or_default()
+            .push(row);
+    }
+    let mut all: Vec<Loop> = Vec::new();
+    for (iri, rows) in by_loop {
+        let read = read(iri, &rows, order, conditions);
+        let read = read.map_err(|why| format!("the loop {iri} {why}"))?;
+        let is_apart =
+            |other: &Loop| other.steps.is_disjoint(&read.steps) || other.is_within(&read);
+        if !all
+            .iter()
+            .all(|other| is_apart(other) || read.is_within(other))
+        {
+            return Err(format!(
+                "the loop {iri} shares steps with another loop; one has to be within the other"
+            ));
+        }
+        if let Some(step) = caught(&read, steps).and_then(|step| order.get(step)) {
+            return Err(format!(
+                "the loop {iri} waits for the step {step}, which waits for the end of the loop"
+            ));
+        }
+        all.push(read);
+    }
+    Ok(all)
+}
+
+fn read(iri: &str, rows: &[&Row], order: &[&str], conditions: &[Row]) -> Result<Loop, String> {
+    let mut steps = BTreeSet::new();
+    let named = rows.iter().map(|row| Answer::text(row, "step"));
+    for step in named.filter(|step| !step.is_empty()) {
+        let number = order.iter().position(|known| *known == step);
+        steps.insert(number.ok_or_else(|| format!("repeats {step}, which is no step"))?);
+    }
+    if steps.is_empty() {
+        return Err("has no ua:repeats".to_owned());
+    }
+    let rounds = match one(rows, "rounds")? {
+        None => Loop::USUAL_ROUNDS,
+        Some(value) => rounds(value).ok_or_else(|| {
+            let most = Loop::MOST_ROUNDS;
+            format!("has a ua:rounds that is not from 1 to {most}: {value}")
+        })?,
+    };
+    // Its conditions are decided when all its steps are over.
+    let again = conditions_of(iri, (order, order.len()), conditions)?;
+    if again.is_empty() {
+        return Err("has no ua:when".to_owned());
+    }
+    Ok(Loop {
+        steps,
+        again,
+        rounds,
+    })
+}
+
+fn rounds(value: &Value) -> Option<u32> {
+    let rounds = u32::try_from(value.as_u64()?).ok()?;
+    (1..=Loop::MOST_ROUNDS).contains(&rounds).then_some(rounds)
+}
+
+/// Returns a step outside a loop for which the loop waits, and which waits for the loop.
+fn caught(one: &Loop, steps: &[Step]) -> Option<usize> {
+    let mut behind: BTreeSet<usize> = BTreeSet::new();
+    for (number, step) in steps.iter().enumerate() {
+        let waits = step.waits_for(number);
+        if one.steps.contains(&number) {
+            let caught = waits.iter().find(|other| behind.contains(other));
+            if let Some(other) = caught {
+                return Some(*other);
+            }
+        } else if waits
+            .iter()
+            .any(|other| one.steps.contains(other) || behind.contains(other))
+        {
+            behind.insert(number);
+        }
+    }
+    None
+}
