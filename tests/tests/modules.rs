@@ -425,6 +425,49 @@ fn a_service_of_a_module_is_called_as_a_skill() {
 }
 
 #[test]
+fn a_manifest_in_a_folder_is_a_component_until_it_is_removed() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let _module = simulated("stage.aml", &[]);
+    let folder = cell.folder().join("modules");
+    std::fs::create_dir(&folder).unwrap();
+    let supervisor = Started::new("modules", &program("ua-component"))
+        .args(["modules", folder.to_str().unwrap(), "--first", "51", "--"])
+        .args(["--interface", "lo", "--lds", "none", "--pki"])
+        .args([cell.folder().join("pki")])
+        .start();
+    let settings = "capabilities:\n  Solo/Polka: [urn:example:capability:dance]\n";
+    std::fs::write(folder.join("dance.yaml"), settings).unwrap();
+    std::fs::write(folder.join("broken.aml"), "<CAEXFile>").unwrap();
+    std::fs::copy(own("mtp/stage.aml"), folder.join("dance.aml")).unwrap();
+    let call = |name: &str| {
+        let options = ["--interface", "lo", "--wait", "30", "--timeout", "30"];
+        space(&[&["call", name][..], &options].concat())
+    };
+    let ready = call("dance.Solo-Polka.Reset");
+    assert!(ready.status.success(), "{ready:?}\n{supervisor}");
+    let polka = call("dance.Solo-Polka");
+    assert!(polka.status.success(), "{polka:?}");
+    let told = || supervisor.lines().join("\n");
+    eventually("the faulty manifest has a reason", SOON, || {
+        told()
+            .contains("broken: its files are faulty")
+            .then_some(())
+    });
+    std::fs::remove_file(folder.join("dance.aml")).unwrap();
+    eventually("its skills are gone", SOON, || {
+        let listed = space(&["skills", "--interface", "lo"]);
+        (!stdout(&listed).contains("Solo-Polka")).then_some(())
+    });
+    // It comes back with the same number.
+    std::fs::copy(own("mtp/stage.aml"), folder.join("dance.aml")).unwrap();
+    let ready = call("dance.Solo-Polka.Reset");
+    assert!(ready.status.success(), "{ready:?}\n{}", told());
+    let numbers = std::fs::read_to_string(folder.join(".ua-component/numbers.json")).unwrap();
+    let numbers: Value = serde_json::from_str(&numbers).unwrap();
+    assert_eq!(numbers, json!({"broken": 51, "dance": 52}));
+}
+
+#[test]
 fn a_service_is_run_once_by_a_command_that_ctrl_c_stops() {
     let Some(cell) = Cell::with(&[]) else { return };
     let _module = simulated("stage.aml", &[]);

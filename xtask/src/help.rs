@@ -7,7 +7,8 @@ use anyhow::{Context as _, ensure};
 use crate::{links, shell::line};
 
 /// Verbs that the help of their program lists outside of its commands.
-const FURTHER: [&[&str]; 6] = [
+const FURTHER: [&[&str]; 7] = [
+    &["ua-component", "modules"],
     &["ua-component", "simulate"],
     &["ua-server", "certificates"],
     &["ua-server", "reject"],

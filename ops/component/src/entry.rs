@@ -16,14 +16,15 @@ use skills::yaml::Code;
 use skills::{Component, Lds, Security};
 
 use crate::reload::{ComponentFile, Overrides, ReadComponent, Version};
-use crate::{ComponentPort, Options, made, simulate};
+use crate::{ComponentPort, Options, made, modules, simulate};
 
 /// A component of the cell: an OPC UA server with skills, which are values and calls of the space too.
 #[derive(Debug, clap::Parser)]
 #[command(
     name = "ua-component",
     version = plant_opcua::patches::version(),
-    after_help = "`ua-component simulate --help`: devices behind their protocols, to try drivers with"
+    after_help = "`ua-component simulate --help`: devices behind their protocols, to try drivers with\n\
+                  `ua-component modules --help`: a component for each manifest (MTP) in a folder"
 )]
 struct UaComponent {
     /// The YAML of the component
@@ -95,6 +96,7 @@ enum Schema {
 pub fn run(arguments: Vec<OsString>) -> ExitCode {
     match arguments.get(1) {
         Some(first) if first == simulate::VERB => simulate::run(arguments.into_iter().skip(1)),
+        Some(first) if first == modules::VERB => modules::run(arguments.into_iter().skip(1)),
         _ => bridge_node::run::<UaComponent>(arguments),
     }
 }

@@ -16,6 +16,8 @@ mod fields;
 mod goals;
 mod idle;
 mod mirrors;
+#[cfg(feature = "devices")]
+mod modules;
 mod partners;
 mod port;
 mod reload;

@@ -21,7 +21,8 @@ pub(crate) use write::Write;
 
 pub(crate) use job::{GoalArguments, JobArguments, JobVerb, ProcessArguments, ProcessVerb};
 pub(crate) use module::{
-    AasArguments, MtpAlarms, MtpArguments, MtpRdf, MtpRun, MtpSkills, MtpVerb, PeaArguments,
+    AasArguments, MtpAlarms, MtpArguments, MtpConnect, MtpRdf, MtpRun, MtpSkills, MtpVerb,
+    PeaArguments,
 };
 
 use std::path::PathBuf;

@@ -32,6 +32,7 @@ mod make_keys;
 mod messages;
 mod metadata;
 mod mtp_alarms;
+mod mtp_connect;
 mod mtp_files;
 mod mtp_run;
 mod new;

@@ -20,6 +20,7 @@ pub(crate) fn mtp(arguments: &MtpArguments) -> Result<(), Failure> {
         MtpVerb::Rdf(arguments) => rdf(arguments),
         MtpVerb::Skills(arguments) => skills(arguments),
         MtpVerb::Alarms(arguments) => crate::mtp_alarms::alarms(arguments),
+        MtpVerb::Connect(arguments) => crate::mtp_connect::connect(arguments),
         MtpVerb::Run(arguments) => crate::mtp_run::run(arguments),
     }
 }

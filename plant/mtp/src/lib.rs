@@ -9,12 +9,15 @@
 //! (2.15, 3.0) and in references (by RefID or by ID). The model has a single name for each concept.
 //! An inconsistency in a file is a [`Finding`], and the rest of the file is used.
 //!
+//! [`connect::proposals`] finds outputs of modules for the inputs of others.
+//!
 //! [`Module::triples`] returns the same as RDF, in the terms of [`vocabulary`]. [`state`] is the
 //! state machine of services, and [`pea::Pea`] simulates the module of a manifest.
 //!
 //! This crate opens no file and calls no server.
 
 mod caex;
+pub mod connect;
 mod container;
 mod elements;
 mod model;

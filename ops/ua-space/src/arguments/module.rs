@@ -22,6 +22,11 @@ pub(crate) enum MtpVerb {
     Skills(MtpSkills),
     /// Print the alarms of a manifest as a part of a mapping: variables with conditions at ua-server
     Alarms(MtpAlarms),
+    /// Propose process values of modules as inputs of others, as a part of a mapping
+    ///
+    /// An output fits if it has the kind and the unit of the input, and its scale is not known to
+    /// exceed that of the input. Where names do not decide, all outputs that fit are comments.
+    Connect(MtpConnect),
     /// Run a procedure of a service once, and print its states and results
     ///
     /// Follows the handshake of VDI/VDE/NAMUR 2658-4. Ctrl-C withdraws a Start without effect, or
@@ -129,6 +134,52 @@ pub(crate) struct MtpAlarms {
     /// The endpoint of the module, if it differs from the manifest
     #[arg(long, value_name = "URL")]
     pub(crate) endpoint: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MtpConnect {
+    /// The manifests (.aml, .mtp, .amlx) of two or more modules
+    #[arg(value_name = "FILE", num_args = 2.., required = true)]
+    pub(crate) files: Vec<String>,
+    /// The index of the namespace of the variables, which the mapping lists
+    #[arg(long, value_name = "INDEX", default_value = "2", value_parser = clap::value_parser!(u16).range(2..))]
+    pub(crate) namespace: u16,
+    /// The identifier of the first variable; the next ones follow
+    #[arg(long, value_name = "ID", default_value = "1", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) first: u16,
+    /// The endpoint of a module, if it differs from the manifest; can be repeated
+    #[arg(long = "endpoint", value_name = "MODULE=URL")]
+    pub(crate) endpoints: Vec<ModuleEndpoint>,
+}
+
+/// The endpoint of a module.
+#[derive(Debug, Clone)]
+pub(crate) struct ModuleEndpoint {
+    module: String,
+    url: String,
+}
+
+impl std::str::FromStr for ModuleEndpoint {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let parts = text.split_once('=');
+        let parts = parts.filter(|(module, url)| !module.is_empty() && url.contains("://"));
+        let (module, url) =
+            parts.ok_or("a module with its endpoint, as dosing=opc.tcp://10.0.0.5:4840")?;
+        Ok(Self {
+            module: module.to_owned(),
+            url: url.to_owned(),
+        })
+    }
+}
+
+impl MtpConnect {
+    /// Returns the endpoint that the command line gives a module.
+    pub(crate) fn endpoint(&self, module: &str) -> Option<&str> {
+        let given = self.endpoints.iter().find(|one| one.module == module);
+        given.map(|one| one.url.as_str())
+    }
 }
 
 #[derive(Debug, Args)]
