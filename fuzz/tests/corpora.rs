@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use uadp_fuzz::TARGETS;
 
@@ -86,14 +87,31 @@ impl Chance {
     }
 }
 
+/// Returns the largest memory of this process so far in MiB, as the kernel counts it.
+fn peak_memory() -> u64 {
+    let status = fs::read_to_string("/proc/self/status").unwrap();
+    let mut lines = status.lines();
+    let peak = lines.find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+    let kib: u64 = peak.trim().trim_end_matches(" kB").parse().unwrap();
+    kib / 1024
+}
+
+/// Returns the time, by which the duration of a target is printed.
+#[expect(clippy::disallowed_methods, reason = "prints durations only")]
+fn now() -> Instant {
+    Instant::now()
+}
+
 /// Runs `UA_FUZZ_CHANGES` changed inputs of each target, by default 2000. `UA_FUZZ_SEED` selects
-/// the inputs, and `UA_FUZZ_TARGETS` the targets, separated by commas.
+/// the inputs, and `UA_FUZZ_TARGETS` the targets, separated by commas. No target may need more than
+/// `UA_FUZZ_MEMORY` MiB, by default 2000.
 #[test]
 fn changed_inputs_are_taken_without_a_finding() {
     let number = |variable: &str, default: u64| {
         std::env::var(variable).map_or(default, |text| text.parse().unwrap())
     };
     let (changes, seed) = (number("UA_FUZZ_CHANGES", 2_000), number("UA_FUZZ_SEED", 1));
+    let memory = number("UA_FUZZ_MEMORY", 2_000);
     let only = std::env::var("UA_FUZZ_TARGETS").ok();
     let chosen = |name: &str| {
         only.as_ref()
@@ -105,6 +123,7 @@ fn changed_inputs_are_taken_without_a_finding() {
             .map(|path| fs::read(path).unwrap())
             .filter(|input| input.len() <= 4096)
             .collect();
+        let began = now();
         let mut chance = Chance(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
         for _ in 0..changes {
             let mut input = kept[chance.below(kept.len())].clone();
@@ -116,6 +135,12 @@ fn changed_inputs_are_taken_without_a_finding() {
                 panic!("{name}: {panic:?} of {input:02x?}");
             }
         }
+        let (time, peak) = (began.elapsed().as_secs_f64(), peak_memory());
+        println!("{name}: {changes} changed inputs in {time:.1} s, at most {peak} MiB of memory");
+        assert!(
+            peak <= memory,
+            "{name} needed {peak} MiB, more than {memory}"
+        );
     }
 }
 
