@@ -193,52 +193,58 @@ impl Handshake<'_> {
             return Err(format!("{name} has no node for writing"));
         };
         self.limits(parameter, value).await?;
-        let shake = |wanted: &str| {
-            let mut nodes = parameter.handshake.iter();
-            nodes
-                .find(|(known, _)| known == wanted)
-                .map(|(_, node)| node)
-        };
-        let follows_service = match shake("Sync") {
-            Some(sync) => self.is_true(sync).await?,
-            None => false,
-        };
-        if !follows_service {
-            self.request(
-                shake("StateAutAct"),
-                [shake("StateAutOp"), shake("StateAutAut")],
-                &format!("automatic mode of {name}"),
-            )
-            .await?;
-            self.request(
-                shake("SrcExtAct"),
-                [shake("SrcExtOp"), shake("SrcExtAut")],
-                &format!("the external source of {name}"),
-            )
-            .await?;
-        }
+        self.external(parameter).await?;
         self.write(node, value.clone(), &format!("{name}.VExt"))
             .await?;
         let is_written = |read: &Value| is_equal(value, read);
         self.wait(node, is_written, &format!("the value of {name} (VExt)"))
             .await?;
-        let Some(apply) = shake("ApplyExt") else {
+        let Some(apply) = shaken(parameter, "ApplyExt") else {
             return Ok(());
         };
-        if let Some(enabled) = shake("ApplyEn") {
+        if let Some(enabled) = shaken(parameter, "ApplyEn") {
             let is_enabled = |read: &Value| *read == Value::Boolean(true);
             self.wait(enabled, is_enabled, &format!("ApplyEn of {name}"))
                 .await?;
         }
         self.write(apply, Value::Boolean(true), &format!("{name}.ApplyExt"))
             .await?;
-        match shake("VReq") {
+        match shaken(parameter, "VReq") {
             Some(requested) => {
                 let what = format!("the applied value of {name} (VReq)");
                 self.wait(requested, is_written, &what).await
             }
             None => Ok(()),
         }
+    }
+
+    /// Makes the value from outside effective: a parameter follows its service (Sync), or has its
+    /// own mode and source.
+    async fn external(&self, parameter: &Parameter) -> Result<(), String> {
+        let name = &parameter.name;
+        let of = |wanted| shaken(parameter, wanted);
+        let sync = of("Sync");
+        if let Some(sync) = sync
+            && self.is_true(sync).await?
+        {
+            return Ok(());
+        }
+        let (mode, source) = (of("StateAutAct"), of("SrcExtAct"));
+        if let Some(sync) = sync
+            && mode.or(source).is_none()
+            && sync.access.writes
+        {
+            let what = format!("{name}.Sync");
+            self.write(sync, Value::Boolean(true), &what).await?;
+            let is_set = |read: &Value| *read == Value::Boolean(true);
+            return self.wait(sync, is_set, &what).await;
+        }
+        let what = format!("automatic mode of {name}");
+        self.request(mode, [of("StateAutOp"), of("StateAutAut")], &what)
+            .await?;
+        let what = format!("the external source of {name}");
+        self.request(source, [of("SrcExtOp"), of("SrcExtAut")], &what)
+            .await
     }
 
     /// Checks the limits that the file or the module has.
@@ -399,4 +405,11 @@ fn as_word(value: &Value) -> u32 {
     number
         .and_then(|number| u32::try_from(number).ok())
         .unwrap_or_default()
+}
+
+/// Returns the node of a parameter with a name of the handshake.
+fn shaken<'p>(parameter: &'p Parameter, wanted: &str) -> Option<&'p Node> {
+    let mut nodes = parameter.handshake.iter();
+    let found = nodes.find(|(known, _)| known == wanted);
+    found.map(|(_, node)| node)
 }
