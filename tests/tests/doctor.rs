@@ -4,6 +4,7 @@ use std::net::UdpSocket;
 use std::path::Path;
 use std::time::Duration;
 
+use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, Peer, Started, eventually, metrics, program};
 
@@ -132,6 +133,89 @@ fn doctor_finds_two_bridges_of_a_space_and_mappings_that_differ() {
     });
     let status = metrics(METRICS_ROS2).unwrap();
     assert_eq!(status["program"], "bridge-ros2");
+}
+
+#[test]
+fn doctor_finds_faults_of_running_programs() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let text = "spaces: [{id: 2}]\nnamespaces: {2: urn:test}\nvariables: []\n";
+    let mapping = cell.file("cell.yaml", text);
+    let bridge = cell.bridge_ros2(&[mapping.to_str().unwrap()]);
+    let has =
+        |code: &str, variables: &[(&str, &str)]| codes(variables).iter().any(|found| found == code);
+    for code in ["D037", "D051"] {
+        assert!(!has(code, &[]), "{code} before anything is broken");
+    }
+    // A node of another domain than the bridge.
+    assert!(has("D023", &[("ROS_DOMAIN_ID", "7")]));
+    assert!(!has("D023", &[("ROS_DOMAIN_ID", "2")]));
+    // The file is changed, and what it says now cannot run.
+    std::fs::write(&mapping, "variables: 3\n").unwrap();
+    bridge.signal(Signal::SIGHUP);
+    eventually("the older mapping is found", SOON, || {
+        has("D037", &[]).then_some(())
+    });
+    // No ROS master answers the other bridge.
+    let _waiting = cell.bridge_ros1(&[]);
+    eventually("the unready bridge is found", SOON, || {
+        let (_, found) = ua_space(&["doctor", "--seconds", "1"], &[]);
+        let mut all = found["findings"].as_array()?.iter();
+        let is_it = |one: &Value| {
+            let what = one["what"].as_str().unwrap_or_default();
+            one["code"] == "D035" && what.contains("bridge-ros1") && what.contains("not ready")
+        };
+        all.any(is_it).then_some(())
+    });
+    // Its files and sockets reach their limit.
+    let process = bridge.id().to_string();
+    let open = std::fs::read_dir(format!("/proc/{process}/fd")).unwrap();
+    let limit = format!("--nofile={}", open.count() + 2);
+    let limited = std::process::Command::new("prlimit")
+        .args(["--pid", &process, &limit])
+        .status();
+    assert!(limited.unwrap().success());
+    assert!(has("D051", &[]));
+}
+
+#[test]
+fn doctor_finds_a_network_bridge_without_a_querier_and_mends_it() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    // The interfaces of this network are in a /sys of its own.
+    let doctor = |more: &str| {
+        let script = format!(
+            "mount -t sysfs sysfs /sys && exec {} doctor --seconds 0.5 --json {more}",
+            program("ua-space").display()
+        );
+        let mut child = Started::new("doctor", Path::new("/usr/bin/unshare"))
+            .args(["--mount", "sh", "-c", &script])
+            .start();
+        child.wait_for_end(SOON);
+        child.lines().iter().any(|line| line.contains("\"D071\""))
+    };
+    assert!(!doctor(""));
+    for words in [
+        &[
+            "link",
+            "add",
+            "br7",
+            "type",
+            "bridge",
+            "mcast_snooping",
+            "1",
+        ][..],
+        &["addr", "add", "10.77.7.1/24", "dev", "br7"],
+        &["link", "set", "br7", "up"],
+    ] {
+        let ip = std::process::Command::new("ip").args(words).status();
+        assert!(ip.unwrap().success(), "{words:?}");
+    }
+    assert!(doctor(""), "nothing asks for the members of the group");
+    assert!(doctor("--fix"), "it is found, and then mended");
+    assert!(!doctor(""));
 }
 
 #[test]
