@@ -1,5 +1,5 @@
 """Drives the page of the cell in Chromium: every view of a running demo, in both colours and at the
-width of a phone, by the rules of axe-core, and the commands and alarms of a signed-in operator. Any console
+width of a phone, by the rules of axe-core and of HTML, and the commands and alarms of a signed-in operator. Any console
 message fails."""
 
 import argparse
@@ -14,6 +14,7 @@ import tempfile
 import time
 
 from selenium import webdriver
+from selenium.common.exceptions import StaleElementReferenceException
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
@@ -50,7 +51,9 @@ class Judge:
 
     def wait(self, what, condition):
         try:
-            return WebDriverWait(self.driver, SOON, 0.2).until(lambda _: condition())
+            # The page replaces elements between a look and the next one.
+            wait = WebDriverWait(self.driver, SOON, 0.2, ignored_exceptions=[StaleElementReferenceException])
+            return wait.until(lambda _: condition())
         except Exception:
             self.shoot("fault")
             text = self.driver.find_element(By.TAG_NAME, "body").text
@@ -71,7 +74,11 @@ class Judge:
             self.faults.append(f"{name}: the page is {wide} px wider than the window")
 
     def accessible(self, name):
-        """Applies the rules of axe-core."""
+        """Applies the rules of axe-core, and keeps the document for the validator."""
+        html = self.driver.execute_script("return document.documentElement.outerHTML")
+        folder = self.out / "html"
+        folder.mkdir(exist_ok=True)
+        (folder / f"{name}.html").write_text(f"<!DOCTYPE html>\n{html}\n")
         self.driver.execute_script(self.axe)
         broken = self.driver.execute_async_script(
             "const done = arguments[arguments.length - 1];"
@@ -82,6 +89,22 @@ class Judge:
     def console(self):
         for entry in self.driver.get_log("browser"):
             self.faults.append(f"console: {entry['level']} {entry['message']}")
+
+
+    def valid(self, validator, out):
+        """Applies the rules of the HTML standard to all documents that were kept."""
+        config = out / "rules.json"
+        config.write_text(json.dumps({"root": True, "extends": ["html-validate:standard"]}))
+        documents = sorted(out.glob("**/html/*.html"))
+        ended = subprocess.run([validator, "--config", config, "--formatter", "json", *documents], capture_output=True, text=True)
+        if not documents or ended.returncode not in (0, 1):
+            raise SystemExit(f"the validator read {len(documents)} documents:\n{ended.stderr}")
+        broken = {}
+        for document in json.loads(ended.stdout or "[]"):
+            for one in document["messages"]:
+                broken.setdefault((one["ruleId"], one["message"]), []).append(pathlib.Path(document["filePath"]).stem)
+        self.faults.extend(f"HTML: {rule}: {message} in {', '.join(sorted(set(of))[:4])}" for (rule, message), of in broken.items())
+        return len(documents)
 
 
 def page_of(demo):
@@ -384,10 +407,12 @@ def knowledge(judge, binaries, folder):
                 judge.shoot(name)
                 judge.overflow(name)
                 judge.accessible(name)
+                judge.driver.execute_script("document.querySelector('.graph').scrollIntoView()")
+                judge.shoot(name.replace("graph", "drawing"))
         judge.look("light", WIDE)
         choose("state-of")
         judge.wait("the parameter has a field", lambda: find(".parameters input"))[0].send_keys("grasp", Keys.ENTER)
-        judge.wait("the question is answered", lambda: "skill_name" in judge.text(".result thead"))
+        judge.wait("the question is answered", lambda: "skill_name" in [one.text for one in find(".result th")])
         judge.shoot("knowledge-question-light-wide")
         judge.accessible("question")
         judge.console()
@@ -405,11 +430,16 @@ def main():
     parser.add_argument("--binaries", type=pathlib.Path, required=True)
     parser.add_argument("--examples", type=pathlib.Path, required=True)
     parser.add_argument("--axe", type=pathlib.Path, required=True)
+    parser.add_argument("--validator", type=pathlib.Path, required=True, help="html-validate")
     parser.add_argument("--out", type=pathlib.Path, required=True)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     judge = Judge(arguments.out, arguments.axe)
-    for scenario, more in [("line-by-topics", ["--covers", "40", "--conveyor-off-at", "600"]), ("assembly-line", ["--covers", "12"])]:
+    with tempfile.TemporaryDirectory() as folder:
+        operate(judge, arguments.binaries, pathlib.Path(folder), arguments.examples)
+        alarms(judge, arguments.binaries, pathlib.Path(folder))
+        knowledge(judge, arguments.binaries, pathlib.Path(folder))
+    for scenario, more in [("line-by-topics", ["--covers", "40", "--conveyor-off-at", "600"]), ("assembly-line", ["--covers", "24"])]:
         command = [arguments.binaries / "demo", "--scenario", scenario, *more]
         demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         recorder = None
@@ -432,21 +462,21 @@ def main():
             judge.console()
             judge.driver.get("about:blank")
         finally:
-            demo.send_signal(signal.SIGINT)
+            ended = demo.poll()
+            if ended is None:
+                demo.send_signal(signal.SIGINT)
             if recorder:
                 recorder.send_signal(signal.SIGINT)
-            demo.communicate(timeout=60)
+            told, _ = demo.communicate(timeout=60)
+            if ended is not None:
+                print(f"the demo ended with {ended} before the judge did:\n{told[-3000:]}")
             if recorder:
                 recorder.wait(20)
         if scenario == "line-by-topics":
             recorded(judge, arguments.binaries, recording)
-    judge.out = arguments.out
-    with tempfile.TemporaryDirectory() as folder:
-        operate(judge, arguments.binaries, pathlib.Path(folder), arguments.examples)
-        alarms(judge, arguments.binaries, pathlib.Path(folder))
-        knowledge(judge, arguments.binaries, pathlib.Path(folder))
     judge.driver.quit()
-    print(json.dumps({"screenshots": str(arguments.out), "faults": judge.faults}, indent=2))
+    documents = judge.valid(arguments.validator, arguments.out)
+    print(json.dumps({"screenshots": str(arguments.out), "documents": documents, "faults": judge.faults}, indent=2))
     sys.exit(bool(judge.faults))
 
 

@@ -16,6 +16,7 @@ mod instructions;
 mod links;
 mod lint;
 mod markdown;
+mod module;
 mod namespace;
 mod page;
 mod patches;
@@ -34,6 +35,7 @@ cargo xtask <verb>
   demo [ARGS]                    build the programs and run the assembly line; ARGS go to it (--help lists them)
   test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
   page                           drive the page of the cell in Chromium (apt, pip); screenshots are in target/page
+  mtp2                           judge our reader and executor of MTP 2.0 by MTPPy2.0 (pip; needs Python 3.13)
   peers [--build]                only install the peers; of those only what the programs are built with
   lint [--dependencies]          formatting, clippy, documentation; or licences, sources and advisories of dependencies, and the
                                  workspace with all crates as published
@@ -81,6 +83,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         }
         ["demo", rest @ ..] => demo::run(&Workspace::find()?, rest),
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
+        ["mtp2"] => module::run(&Workspace::find()?),
         ["page"] => page::run(&Workspace::find()?),
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["peers", "--build"] => peers::for_building(),

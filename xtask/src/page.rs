@@ -14,10 +14,10 @@ use crate::{
 /// # Errors
 /// Returns an error if Chromium cannot be installed or the programs cannot be built.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
-    let (python, axe) = peers::browser(workspace)?;
+    let browser = peers::browser(workspace)?;
     demo::build(workspace)?;
     step("driving the page in Chromium");
-    let mut judge = Command::new(python);
+    let mut judge = Command::new(browser.python);
     judge
         .arg(workspace.root.join("tests/peers/page_judge.py"))
         .arg("--binaries")
@@ -25,7 +25,9 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
         .arg("--examples")
         .arg(workspace.root.join("examples/plant"))
         .arg("--axe")
-        .arg(axe)
+        .arg(browser.axe)
+        .arg("--validator")
+        .arg(browser.validator)
         .arg("--out")
         .arg(workspace.target.join("page"));
     Ok(status(&mut judge)?.into())

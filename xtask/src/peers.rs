@@ -76,34 +76,79 @@ const APT_NODE: &[&str] = &["nodejs", "npm"];
 /// The browser of the judge of the page; tests do not need it.
 const APT_BROWSER: &[&str] = &["chromium", "chromium-driver"];
 
-/// Installs the browser that judges the page. Returns the Python that drives it, and the script
-/// with the accessibility rules.
+/// The judge of the page.
+pub(crate) struct PageJudge {
+    /// The Python that drives the browser.
+    pub(crate) python: PathBuf,
+    /// The script with the accessibility rules.
+    pub(crate) axe: PathBuf,
+    /// The validator of HTML.
+    pub(crate) validator: PathBuf,
+}
+
+/// Installs the browser that judges the page, and the rules of accessibility and of HTML.
 ///
 /// # Errors
 /// Returns an error if a package cannot be installed.
-pub(crate) fn browser(workspace: &Workspace) -> anyhow::Result<(PathBuf, PathBuf)> {
+pub(crate) fn browser(workspace: &Workspace) -> anyhow::Result<PageJudge> {
     apt_install(APT_BROWSER)?;
     venv(workspace, "browser", "page.txt")?;
     if !succeeds("npm", &["--version"]) {
         apt_install(APT_NODE)?;
     }
     let folder = workspace.peers().join("axe");
-    if !folder.join(AXE_SCRIPT).is_file() {
-        step("installing from npm: axe-core");
+    let (axe, validator) = (folder.join(AXE_SCRIPT), folder.join(VALIDATOR_PROGRAM));
+    if !axe.is_file() || !validator.exists() {
+        step("installing from npm: axe-core, html-validate");
         let mut npm = Command::new("npm");
         npm.args(["install", "--ignore-scripts", "--no-audit", "--no-fund"])
             .args(["--loglevel=error", "--prefix"])
             .arg(&folder)
-            .arg(AXE);
+            .args([AXE, VALIDATOR]);
         must(&mut npm)?;
     }
-    let python = python_of(&workspace.peers().join("browser"));
-    Ok((python, folder.join(AXE_SCRIPT)))
+    Ok(PageJudge {
+        python: python_of(&workspace.peers().join("browser")),
+        axe,
+        validator,
+    })
+}
+
+/// Installs MTPPy2.0, which needs a newer Python than the other peers. Returns the Python with it.
+///
+/// # Errors
+/// Returns an error if Python 3.13 is missing, or a package cannot be installed.
+pub(crate) fn mtppy2(workspace: &Workspace) -> anyhow::Result<PathBuf> {
+    let folder = "mtppy2";
+    let python =
+        newer_python().context("Python 3.13 is missing, which MTPPy2.0 needs: install it")?;
+    venv_of(workspace, &python, (folder, "mtppy2.txt"))?;
+    Ok(python_of(&workspace.peers().join(folder)))
+}
+
+/// Finds Python 3.13 in PATH, or among the versions of pyenv, whose links work only for the chosen
+/// version.
+fn newer_python() -> Option<PathBuf> {
+    const NAME: &str = "python3.13";
+    if succeeds(NAME, &["--version"]) {
+        return Some(NAME.into());
+    }
+    let root = std::env::var_os("PYENV_ROOT").map(PathBuf::from);
+    let root = root.or_else(|| Some(Path::new(&std::env::var_os("HOME")?).join(".pyenv")))?;
+    let versions = fs::read_dir(root.join("versions")).ok()?;
+    let mut found = versions.map_while(Result::ok);
+    found.find_map(|version| {
+        let python = version.path().join("bin").join(NAME);
+        python.exists().then_some(python)
+    })
 }
 
 /// The accessibility rules of the judge of the page.
 const AXE: &str = "axe-core@4.14.0";
 const AXE_SCRIPT: &str = "node_modules/axe-core/axe.min.js";
+/// The validator of HTML.
+const VALIDATOR: &str = "html-validate@11.21.1";
+const VALIDATOR_PROGRAM: &str = "node_modules/.bin/html-validate";
 
 /// Installs missing peers. Failures are printed; the tests of these peers then skip themselves, or
 /// fail with `CI=true`.
@@ -242,6 +287,23 @@ fn as_root(program: &str) -> Command {
 }
 
 fn venv(workspace: &Workspace, folder: &str, requirements: &str) -> anyhow::Result<()> {
+    // The system Python is preferred, because ROS 1 is built for it; PATH may have another Python
+    // first.
+    let system = Path::new("/usr/bin/python3");
+    let python3 = if system.exists() {
+        system
+    } else {
+        Path::new("python3")
+    };
+    venv_of(workspace, python3, (folder, requirements))
+}
+
+/// Makes an environment of a Python with the packages of a list, if it is not there.
+fn venv_of(
+    workspace: &Workspace,
+    python3: &Path,
+    (folder, requirements): (&str, &str),
+) -> anyhow::Result<()> {
     let folder = workspace.peers().join(folder);
     let requirements = workspace.root.join("tests/peers").join(requirements);
     let wanted = fs::read_to_string(&requirements)
@@ -255,14 +317,6 @@ fn venv(workspace: &Workspace, folder: &str, requirements: &str) -> anyhow::Resu
         folder.display(),
         wanted.split_whitespace().collect::<Vec<_>>().join(" ")
     ));
-    // The system Python is preferred, because ROS 1 is built for it; PATH may have another Python
-    // first.
-    let system = Path::new("/usr/bin/python3");
-    let python3 = if system.exists() {
-        system
-    } else {
-        Path::new("python3")
-    };
     must(
         Command::new(python3)
             .args(["-m", "venv", "--clear"])
