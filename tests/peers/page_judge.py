@@ -407,7 +407,7 @@ def knowledge(judge, binaries, folder):
                 judge.shoot(name)
                 judge.overflow(name)
                 judge.accessible(name)
-                judge.driver.execute_script("document.querySelector('.graph').scrollIntoView()")
+                judge.driver.execute_script("document.querySelector('.graph').scrollIntoView({block: 'center'})")
                 judge.shoot(name.replace("graph", "drawing"))
         judge.look("light", WIDE)
         choose("state-of")

@@ -7,6 +7,10 @@ const HEIGHT = 520;
 const MOST_NODES = 60;
 const MOST_LABELS = 40;
 const STEPS = 250;
+/** The longest ideal length of an arrow; nodes further apart than a multiple of it do not repel each other. */
+const LONGEST = 200;
+const REACH = 1.6;
+const MARGIN = 36;
 
 const PREFIXES = {
   "http://www.w3id.org/hsu-aut/css#": "css:", "http://www.w3id.org/hsu-aut/cask#": "cask:",
@@ -52,9 +56,9 @@ function read(rows) {
   return { nodes: [...nodes.values()], arrows, left };
 }
 
-/** Places the nodes: all repel each other, and arrows pull their ends together. */
+/** Places the nodes: near ones repel each other, and arrows pull their ends together. */
 function place(nodes, arrows) {
-  const ideal = Math.sqrt((WIDTH * HEIGHT) / Math.max(nodes.length, 1)) * 0.75;
+  const ideal = Math.min(Math.sqrt((WIDTH * HEIGHT) / Math.max(nodes.length, 1)) * 0.75, LONGEST);
   nodes.forEach((node, at) => {
     const angle = (2 * Math.PI * at) / nodes.length;
     node.x = WIDTH / 2 + (WIDTH / 3) * Math.cos(angle);
@@ -71,7 +75,7 @@ function place(nodes, arrows) {
       one.dx += (dx / far) * by; one.dy += (dy / far) * by;
       other.dx -= (dx / far) * by; other.dy -= (dy / far) * by;
     };
-    nodes.forEach((one, at) => nodes.slice(at + 1).forEach((other) => push(one, other, (far) => (ideal * ideal) / far)));
+    nodes.forEach((one, at) => nodes.slice(at + 1).forEach((other) => push(one, other, (far) => (far < ideal * REACH ? (ideal * ideal) / far : 0))));
     for (const { from, to } of arrows) if (from !== to) push(from, to, (far) => (-far * far) / ideal);
     for (const node of nodes) {
       const far = Math.max(Math.hypot(node.dx, node.dy), 1);
@@ -79,6 +83,18 @@ function place(nodes, arrows) {
       node.y = Math.min(HEIGHT - 24, Math.max(24, node.y + (node.dy / far) * Math.min(far, heat)));
     }
   }
+}
+
+/** Moves the nodes to the middle and the top. Returns the height that they need. */
+function crop(nodes) {
+  const ends = (of) => [Math.min(...nodes.map(of)), Math.max(...nodes.map(of))];
+  const [left, right] = ends((node) => node.x);
+  const [top, bottom] = ends((node) => node.y);
+  for (const node of nodes) {
+    node.x += WIDTH / 2 - (left + right) / 2;
+    node.y += MARGIN - top;
+  }
+  return bottom - top + 2 * MARGIN;
 }
 
 /** Returns the point of an arrow at the edge of a node of this half width. */
@@ -94,13 +110,14 @@ export function draw(rows) {
   const { nodes, arrows, left } = read(rows);
   if (!arrows.length) return null;
   place(nodes, arrows);
+  const height = crop(nodes);
   for (const node of nodes) {
     node.label = short(node.cell);
     node.half = Math.max(16, node.label.length * 3.4 + 8);
   }
   const about = `${several(nodes.length, "node")}, ${several(arrows.length, "arrow")}`;
   const named = arrows.length <= MOST_LABELS;
-  const picture = s("svg", { class: "graph", viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": `Graph of the result: ${about}. The table has the same statements.` },
+  const picture = s("svg", { class: "graph", viewBox: `0 0 ${WIDTH} ${height.toFixed(0)}`, role: "img", "aria-label": `Graph of the result: ${about}. The table has the same statements.` },
     s("defs", {}, s("marker", { id: "graph-end", viewBox: "0 0 8 8", refX: 7, refY: 4, markerWidth: 7, markerHeight: 7, orient: "auto" },
       s("path", { class: "graph-end", d: "M0 0L8 4L0 8Z" }))),
     arrows.map(({ from, to, cell }) => {
@@ -113,7 +130,9 @@ export function draw(rows) {
       s("title", { text: text(node.cell) }),
       s("rect", { x: (node.x - node.half).toFixed(1), y: (node.y - 12).toFixed(1), width: (node.half * 2).toFixed(1), height: 24, rx: node.cell.is === "literal" ? 3 : 12 }),
       s("text", { x: node.x.toFixed(1), y: (node.y + 4).toFixed(1), text: node.label }))));
-  return h("figure", { class: "graph-frame" },
-    h("div", { class: "table-frame", tabindex: 0, role: "region", "aria-label": "Graph" }, picture),
+  const frame = h("div", { class: "table-frame", tabindex: 0, role: "region", "aria-label": "Graph" }, picture);
+  // A narrow window shows the middle first.
+  requestAnimationFrame(() => { frame.scrollLeft = (frame.scrollWidth - frame.clientWidth) / 2; });
+  return h("figure", { class: "graph-frame" }, frame,
     h("figcaption", { class: "muted", text: left ? `${about}; ${several(left, "row")} in the table only` : about }));
 }
