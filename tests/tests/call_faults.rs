@@ -350,6 +350,7 @@ fn forged(datagram: &[u8], id: (u16, u16, u16)) -> Option<Vec<u8>> {
             requestor_id: request.action.requestor_id,
             ..ActionHeader::new(ActionKind::Response)
         },
+        left: None,
         request_id: request.request_id,
         call: 0,
         state: ActionState::Done,

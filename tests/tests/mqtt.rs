@@ -373,6 +373,64 @@ fn a_command_crosses_from_udp_to_a_broker_and_is_never_late() {
     commanded.arrives();
 }
 
+/// A service of ROS 2 behind a broker, which everybody may call.
+const GRIP: &str = "
+spaces: [{id: 1}, {id: 2}]
+namespaces: {5: urn:ua-bridge:system-tests}
+calls:
+  - node: ns=5;i=60
+    name: grip
+    origin: 2
+    open: true
+    ros: {service: /grip, type: std_srvs/Trigger}
+";
+
+/// Calls the service from ROS 1 and returns the response or the error.
+fn grip(cell: &Cell) -> Value {
+    let args = ["/ua_2_5_60", "std_srvs/Trigger", "--value", "{}"];
+    let mut client = cell.rospy("ros1_call.py", &args);
+    client.wait_for_json("an outcome", SOON, |line| {
+        line.get("value").or_else(|| line.get("error")).cloned()
+    })
+}
+
+#[test]
+fn a_call_crosses_from_a_program_with_udp_alone_to_a_broker_and_is_never_late() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Mosquitto]) else {
+        return;
+    };
+    let broker = cell.mosquitto();
+    let _master = cell.roscore();
+    let between = cell.file("between.yaml", BETWEEN);
+    let grips = cell.file("grip.yaml", GRIP);
+    let _server = cell.ua_server(&[between.to_str().unwrap()]);
+    let _ros1 = cell.bridge_ros1(&[]);
+    let _ros2 = cell.bridge_ros2(&[&OVER_MQTT[..], &[grips.to_str().unwrap()]].concat());
+    let serve = ["serve", "--domain", "2", "empty=/grip"];
+    let mut executors = cell.executors([cell.cyclone_started("calls/cyclone.py", &serve)]);
+    let executor = &mut executors[0];
+    assert_eq!(grip(&cell)["success"], true);
+    assert_eq!(executor.counts()["executed"], 1);
+
+    // The broker is stopped until the caller has given up.
+    broker.signal(Signal::SIGSTOP);
+    let outcome = grip(&cell);
+    assert!(
+        outcome.as_str().is_some_and(|of| of.contains("unknown")),
+        "{outcome}"
+    );
+    broker.signal(Signal::SIGCONT);
+    eventually("both programs reach the broker", SOON, || {
+        let ready = |of| http_answer(of, "/readyz").is_some_and(|(code, _)| code == 200);
+        [METRICS_SERVER, METRICS_ROS2]
+            .into_iter()
+            .all(ready)
+            .then_some(())
+    });
+    assert_eq!(grip(&cell)["success"], true);
+    assert_eq!(executor.counts()["executed"], 2);
+}
+
 #[test]
 fn a_secured_group_is_sealed_from_end_to_end_and_the_broker_cannot_read_it() {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python, Peer::Mosquitto]) else {

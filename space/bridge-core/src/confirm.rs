@@ -247,6 +247,7 @@ pub(crate) fn encode(
             requestor_id: Some(PublisherId::UInt16(space)),
             ..ActionHeader::new(ActionKind::Response)
         },
+        left: None,
         request_id: mark.sequence,
         call: 0,
         state: ActionState::Done,

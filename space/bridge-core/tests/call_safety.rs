@@ -4,6 +4,7 @@ use crate::cell;
 use std::cell::Cell as Shared;
 use std::net::SocketAddr;
 use std::rc::Rc;
+use std::time::Duration;
 
 use bridge_core::{
     AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, Offered, Output,
@@ -16,7 +17,7 @@ use uadp::action::{
 };
 use uadp::{
     BuiltinType, Extras, NetworkHeader, NetworkMessage, NetworkMessageType, OwnedPublisherId,
-    PublisherId, Scalar, Variant,
+    PublisherId, Scalar, Timestamp, Variant,
 };
 
 const BRIDGE: usize = 0;
@@ -82,6 +83,7 @@ fn request_to(topic: TopicId, response_address: Option<&str>, request_id: u16) -
             timeout_hint: Some(3_000.0),
             ..ActionHeader::new(ActionKind::Request)
         },
+        left: None,
         request_id,
         call: 0,
         state: ActionState::Executing,
@@ -167,6 +169,63 @@ fn the_chunks_of_a_repetition_fill_in_those_that_were_lost() {
     assert!(told == Ok(answer));
     cell.run(ms(5_000));
     assert!(cell.executions(GRIPPER).is_empty(), "executed once");
+}
+
+/// Returns the time of sending and the TimeoutHint of the requests that a program sent.
+fn times_of_requests(cell: &mut Cell, at: usize) -> Vec<(Option<i128>, Duration)> {
+    let mut times = Vec::new();
+    for datagram in cell.datagrams_of(at) {
+        let message = NetworkMessage::decode(&datagram).unwrap();
+        let Ok(actions) = message.actions(ActionDialect::Standard) else {
+            continue;
+        };
+        let header = message.header();
+        let sent = header.timestamp.map(|time| {
+            let picoseconds = header.picoseconds.unwrap_or_default();
+            Timestamp { time, picoseconds }.unix_nanos()
+        });
+        let waits = actions.flatten().filter_map(|of| of.action.timeout());
+        times.extend(waits.map(|waits| (sent, waits)));
+    }
+    times
+}
+
+#[test]
+fn requests_say_when_they_were_sent_and_how_long_their_caller_still_waits() {
+    for bytes in [1, 900] {
+        let mut cell = plugged_in();
+        cell.kill(GRIPPER);
+        let asked = cell.now().utc.unix_nanos();
+        cell.ask(BRIDGE, AskId(1), (start(), &large(bytes)), ms(1_000));
+        cell.run(ms(600));
+        let times = times_of_requests(&mut cell, BRIDGE);
+        assert!(times.len() > 4, "{times:?}");
+        for (sent, waits) in times {
+            // A broker may deliver each repetition until then, and no later.
+            let until = sent.unwrap() + i128::try_from(waits.as_nanos()).unwrap();
+            let after = until - asked - 1_000_000_000;
+            assert!(after.abs() < 1_000_000, "{bytes} bytes: {after} ns");
+        }
+    }
+}
+
+#[test]
+fn the_chunks_of_a_request_and_of_its_repetitions_have_no_time() {
+    let mut cell = plugged_in();
+    cell.kill(GRIPPER);
+    let before = cell.datagrams_of(BRIDGE).len();
+    cell.ask(BRIDGE, AskId(1), (start(), &large(50_000)), ms(1_000));
+    cell.run(ms(250));
+    let sent = cell.datagrams_of(BRIDGE).split_off(before);
+    let chunks: Vec<&Vec<u8>> = sent
+        .iter()
+        .filter(|datagram| NetworkMessage::decode(datagram).unwrap().is_chunk())
+        .collect();
+    let (first, again) = chunks.split_at(chunks.len() / 3);
+    assert!(!first.is_empty());
+    assert_eq!(first, &again[..first.len()]);
+    let header = NetworkMessage::decode(first[0]).unwrap().header();
+    assert_eq!(header.timestamp, None);
 }
 
 #[test]

@@ -426,24 +426,24 @@ impl Requestor {
         let interval = self.settings.publishing_interval.max(LEAST_INTERVAL);
         let call = self.calls.get_mut(&id)?;
         let again = now.saturating_add(interval);
-        let (state, timeout_hint) = match &mut call.phase {
+        let (state, timeout_hint, left) = match &mut call.phase {
             Phase::Asking { deadline, hint, .. } => {
                 call.next_send = match call.dialect {
                     ActionDialect::Standard => Some(again),
                     ActionDialect::UaNetStandard(_) => None,
                 };
                 let left = deadline.saturating_sub(now).as_secs_f64() * 1000.0;
-                let left = if call.fields.as_fields().bytes().len() > self.settings.large {
+                let hint = if call.fields.as_fields().bytes().len() > self.settings.large {
                     *hint.get_or_insert(left)
                 } else {
                     left
                 };
-                (ActionState::Executing, Some(left))
+                (ActionState::Executing, Some(hint), Some(left))
             }
             Phase::Closing { left, .. } => {
                 *left = left.saturating_sub(1);
                 call.next_send = Some(again);
-                (ActionState::Idle, None)
+                (ActionState::Idle, None, None)
             }
         };
         self.counters.sent += 1;
@@ -462,6 +462,7 @@ impl Requestor {
                 requestor_id: Some(self.id.as_id()),
                 timeout_hint,
             },
+            left,
             request_id,
             call: id,
             state,

@@ -313,6 +313,7 @@ impl<P: Ord + Clone> Responder<P> {
                 requestor_id: entry.key.requestor_id.as_ref().map(OwnedPublisherId::as_id),
                 ..ActionHeader::new(ActionKind::Response)
             },
+            left: None,
             request_id: entry.key.request_id,
             call: id,
             state,

@@ -28,6 +28,9 @@ pub struct ActionToSend<'a> {
     pub address: &'a ActionAddress,
     /// The ActionHeader.
     pub action: ActionHeader<'a>,
+    /// Time in ms for which the Requestor still waits, in requests. It is not encoded. It differs
+    /// from the TimeoutHint of a repeated [large](super::RequestorSettings::large) request.
+    pub left: Option<f64>,
     /// RequestId of the request.
     pub request_id: u16,
     /// Identifies the call within its Requestor or Responder. It is not encoded; it identifies
@@ -76,6 +79,14 @@ impl From<&ActionMessage<'_>> for ActionAddress {
 }
 
 impl ActionToSend<'_> {
+    /// Returns the message with the time that is [`left`](Self::left) as its TimeoutHint. The
+    /// chunks of such a repetition cannot replace lost chunks of another.
+    #[must_use]
+    pub const fn with_time_left(mut self) -> Self {
+        self.action.timeout_hint = self.left;
+        self
+    }
+
     /// Appends the NetworkMessage to `buf`, up to its [`finish`](ActionEncoder::finish) or
     /// [`finish_sealed`](ActionEncoder::finish_sealed). The address replaces PublisherId and
     /// WriterGroupId of `network`.

@@ -76,17 +76,13 @@ impl Values {
         self.overhead > 0
     }
 
-    /// Returns the headers of a request or a response. Over a broker they contain the time of
-    /// sending. On UDP they do not: the chunks of a repetition fill in lost chunks of the first
-    /// transmission, so both must be equal.
-    pub(super) fn action_header(&self, now: Now) -> NetworkHeader<'static> {
+    /// Returns the headers of a request or a response that is sent in chunks. Over a broker they
+    /// contain the time of sending. On UDP they do not: the chunks of a repetition fill in lost
+    /// chunks of the first transmission, so both must be equal.
+    pub(super) fn chunk_header(&self, now: Now) -> NetworkHeader<'static> {
         match self.relay {
             None => NetworkHeader::default(),
-            Some(_) => NetworkHeader {
-                timestamp: Some(now.utc.time),
-                picoseconds: Some(now.utc.picoseconds),
-                ..NetworkHeader::default()
-            },
+            Some(_) => timed_header(now),
         }
     }
 
@@ -108,5 +104,15 @@ impl Values {
     /// Returns whether a request without a time of sending was received over a broker.
     pub(super) const fn is_untimed(&self, header: &NetworkHeader<'_>) -> bool {
         self.arrival.is_some() && header.timestamp.is_none()
+    }
+}
+
+/// Returns headers with the time of sending. A program may forward the message to a broker, whose
+/// receivers judge the age.
+pub(super) fn timed_header(now: Now) -> NetworkHeader<'static> {
+    NetworkHeader {
+        timestamp: Some(now.utc.time),
+        picoseconds: Some(now.utc.picoseconds),
+        ..NetworkHeader::default()
     }
 }

@@ -161,9 +161,9 @@ impl Routes {
         }
         let content = self.content(&message, scope);
         let stores = self.ends.get(path.carrier).and_then(End::within);
+        let is_request = self.is_request(scope, path.carrier);
         // This program may have been stopped for a while, and no receiver on UDP checks the age.
-        let acts = content.is_command()
-            || matches!(scope.role, MessageRole::Request | MessageRole::HiddenCall);
+        let acts = content.is_command() || is_request;
         let judged = stores.or_else(|| acts.then_some(Broker::WITHIN));
         // Probes are forwarded only to carriers of their publisher. The copy of a probe that
         // arrives at such a carrier may be a forwarded one.
@@ -178,7 +178,7 @@ impl Routes {
                 Some(REPEATED)
             }
             _ if !self.may_cross(&message, scope, path) => Some(NOT_AUTHORIZED),
-            (_, Some(within)) => content.refuse(&message, scope, within, now.utc),
+            (_, Some(within)) => content.refuse(&message, (scope, is_request), within, now.utc),
             (Sight::New | Sight::Copy | Sight::Repeated { .. }, None) => None,
         };
         if refused.is_some() {
@@ -295,6 +295,19 @@ impl Routes {
         }
     }
 
+    /// Returns whether a message that arrived at a carrier is a request.
+    fn is_request(&self, scope: MessageScope, by: usize) -> bool {
+        match scope.role {
+            MessageRole::Request => true,
+            // A hidden message from the carrier of the executor is a response or a confirmation.
+            MessageRole::HiddenCall => self.home(scope.publisher, scope) != Some(by),
+            MessageRole::Value
+            | MessageRole::Announcement
+            | MessageRole::Probe
+            | MessageRole::Response => false,
+        }
+    }
+
     /// Returns whether a request may cross. The executor would treat it as a request of this
     /// program, so its sender is judged here as an executor at the carrier judges it.
     fn may_cross(
@@ -303,15 +316,7 @@ impl Routes {
         scope: MessageScope,
         path: MessagePath,
     ) -> bool {
-        let is_request = match scope.role {
-            MessageRole::Request => true,
-            // A hidden message from the carrier of the executor is a response.
-            MessageRole::HiddenCall => self.home(scope.publisher, scope) != Some(path.carrier),
-            MessageRole::Value
-            | MessageRole::Announcement
-            | MessageRole::Probe
-            | MessageRole::Response => false,
-        };
+        let is_request = self.is_request(scope, path.carrier);
         let end = self.ends.get(path.carrier);
         let is_stranger = end.is_some_and(|end| match &end.medium {
             CarrierMedium::Udp(_) => !path.from.ip().is_loopback(),
@@ -451,7 +456,7 @@ impl Content<'_> {
     fn refuse(
         self,
         message: &NetworkMessage<'_>,
-        scope: MessageScope,
+        (scope, is_request): (MessageScope, bool),
         within: Duration,
         now: Timestamp,
     ) -> Option<&'static str> {
@@ -474,7 +479,7 @@ impl Content<'_> {
         }
         let taken = || self.taken(message);
         let is_timed = match scope.role {
-            MessageRole::Request | MessageRole::HiddenCall => sent.is_some(),
+            MessageRole::Request | MessageRole::HiddenCall => !is_request || sent.is_some(),
             MessageRole::Value if self.is_command() => {
                 if taken().is_some_and(|taken| is_aged(taken, now, limit)) {
                     return Some(LATE);

@@ -55,6 +55,7 @@ impl<P> Answer<P> {
                 requestor_id: self.key.requestor_id.as_ref().map(OwnedPublisherId::as_id),
                 ..ActionHeader::new(ActionKind::Response)
             },
+            left: None,
             request_id: self.key.request_id,
             // A response without fields fits every datagram, so no chunk needs a sequence number.
             call: u64::MAX,

@@ -4,6 +4,7 @@ use mappings::TopicId;
 use uadp::action::{ActionAddress, ActionToSend};
 use uadp::{EncodeError, Extras, NetworkHeader, PublisherId};
 
+use super::super::late::timed_header;
 use super::CallTraffic;
 use super::chunks::Of;
 use crate::counters::Reason;
@@ -27,7 +28,7 @@ impl CallTraffic<'_> {
     fn next_chunk(&mut self, now: Now) -> Option<Output> {
         let values_wait = !self.values.paced.is_empty();
         let most = self.most();
-        let header = self.values.action_header(now);
+        let header = self.values.chunk_header(now);
         let calls = self.calls.as_mut()?;
         let chunking = &mut calls.chunking;
         if chunking.is_empty() || !self.values.pace.is_open(now.monotonic) {
@@ -76,7 +77,11 @@ impl CallTraffic<'_> {
     }
 
     fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
-        let header = self.values.action_header(now);
+        let headers = Headers {
+            timed: timed_header(now),
+            of_chunks: self.values.chunk_header(now),
+            most: self.most(),
+        };
         loop {
             let calls = self.calls.as_mut()?;
             if let Some(news) = calls.news.pop_front() {
@@ -88,10 +93,10 @@ impl CallTraffic<'_> {
             let since = calls.since_start(now);
             let answer = calls.responder.poll_transmit(since);
             let answer =
-                answer.map(|(_, answer)| (Of::message(&answer), encode(&answer, &header, bytes)));
+                answer.map(|(_, answer)| (Of::message(&answer), headers.encode(&answer, bytes)));
             let next = answer.or_else(|| {
                 let request = calls.requestor.poll_transmit(since);
-                request.map(|request| (Of::message(&request), encode(&request, &header, bytes)))
+                request.map(|request| (Of::message(&request), headers.encode(&request, bytes)))
             });
             match next {
                 // Timeouts that occurred in the meantime are output.
@@ -124,12 +129,31 @@ enum Told {
     Datagram(TopicId, Of),
 }
 
+/// The headers of requests and responses.
+struct Headers {
+    /// The headers of a message that fits into a datagram.
+    timed: NetworkHeader<'static>,
+    of_chunks: NetworkHeader<'static>,
+    /// The maximum size of a datagram in bytes.
+    most: usize,
+}
+
+impl Headers {
+    /// Encodes the NetworkMessage. The time of sending and the TimeoutHint of a request in a single
+    /// datagram say how long its requestor waits. If repetitions in chunks need no time, they are
+    /// equal.
+    fn encode(&self, action: &ActionToSend<'_>, bytes: &mut Vec<u8>) -> Written {
+        let written = encode(&action.with_time_left(), &self.timed, bytes);
+        if bytes.len() <= self.most || self.of_chunks.timestamp.is_some() {
+            return written;
+        }
+        bytes.clear();
+        encode(action, &self.of_chunks, bytes)
+    }
+}
+
 /// Encodes the NetworkMessage and returns the topic of its call.
-fn encode(
-    action: &ActionToSend<'_>,
-    header: &NetworkHeader<'_>,
-    bytes: &mut Vec<u8>,
-) -> (Option<TopicId>, Result<(), EncodeError>) {
+fn encode(action: &ActionToSend<'_>, header: &NetworkHeader<'_>, bytes: &mut Vec<u8>) -> Written {
     let ActionAddress {
         publisher_id,
         writer_group_id,
@@ -150,3 +174,6 @@ fn encode(
         .and_then(uadp::action::ActionEncoder::finish);
     (topic, written)
 }
+
+/// The topic of the call of a NetworkMessage, and whether the message was encoded.
+type Written = (Option<TopicId>, Result<(), EncodeError>);

@@ -3,8 +3,8 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use uadp::action::{ActionCall, ActionEncoder, ActionHeader, ActionStart, ActionState};
 use uadp::discovery::Probe;
 use uadp::{
-    DataSetHeader, DateTime, Extras, GroupHeader, NetworkHeader, NetworkMessageEncoder, Scalar,
-    SecurityHeader,
+    ChunkBudget, Chunks, DataSetHeader, DateTime, Extras, GroupHeader, NetworkHeader,
+    NetworkMessageEncoder, Scalar, SecurityHeader, Whole,
 };
 
 use super::*;
@@ -375,6 +375,45 @@ fn requests_go_to_the_executor_and_responses_come_back() {
     assert_eq!(targets(&routes.judge(&response, path(MQTT, 1), now)), [UDP]);
     let other = action(ActionKind::Request, (2, 5, 62), 1, Some(now.utc));
     assert_eq!(targets(&routes.judge(&other, path(UDP, 9), now)), NOWHERE);
+}
+
+/// Returns a chunk of a request or response of `ua_2_5_60`, which does not show its direction.
+fn chunk(sent: Option<Timestamp>) -> Vec<u8> {
+    let whole = Whole {
+        message_type: NetworkMessageType::DataSet,
+        writer_id: None,
+        message_sequence_number: 1,
+        bytes: &[7; 3_000],
+    };
+    let budget = ChunkBudget {
+        network_message: 1_400,
+        trailer: 0,
+    };
+    let (header, extras) = (header(2, 5, sent), Extras::default());
+    let mut chunks = Chunks::new(&header, &extras, whole, budget).unwrap();
+    let mut bytes = Vec::new();
+    chunks.append(&mut bytes, &extras).unwrap().unwrap();
+    bytes
+}
+
+#[test]
+fn a_hidden_request_crosses_with_a_time_only_and_a_hidden_response_without() {
+    let cell = CELL.replace("ua_2_5_60, ua_2_5_61", "ua_2_5");
+    let now = start();
+    for (sent, age, refused) in [
+        (None, 0, Some(UNTIMED)),
+        (Some(now.utc), 1000, None),
+        (Some(now.utc), 1001, Some(LATE)),
+    ] {
+        let mut routes = routes_of(&cell);
+        let judgement = routes.judge(&chunk(sent), path(UDP, 9), later(now, age));
+        assert_eq!(judgement.not_forwarded, refused, "{age} ms");
+    }
+    // The executor is at the carrier of the name.
+    let at_udp = CELL.replace("[ua_1_2, ua_0_2_20]", "[ua_2_5]");
+    let mut routes = routes_of(&at_udp.replace("    forward: [ua_2_5_60, ua_2_5_61]\n", ""));
+    let judgement = routes.judge(&chunk(None), path(UDP, 9), now);
+    assert_eq!(targets(&judgement), [MQTT], "{judgement:?}");
 }
 
 #[test]
