@@ -12,6 +12,7 @@
 //! The module has no clock and no socket: times are inputs, and [`Redundancy::due`] returns the
 //! time of the next [`poll`](Redundancy::poll).
 
+mod address;
 mod clocks;
 mod heartbeat;
 mod role;
@@ -19,6 +20,7 @@ mod role;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
+pub(crate) use self::address::SenderAddress;
 pub(crate) use self::clocks::{SenderClocks, SentAt};
 pub use self::heartbeat::Heartbeat;
 pub use self::role::{MuteCause, Rank, Role, RoleChange, SwitchRefusal, TakeoverCause};
@@ -28,7 +30,7 @@ use crate::settings::Now;
 #[derive(Debug, Clone, Copy)]
 pub struct RedundantPeer {
     heartbeat: Heartbeat,
-    from: SocketAddr,
+    address: SenderAddress,
     heard: Instant,
 }
 
@@ -72,7 +74,7 @@ impl RedundantPeer {
     /// Returns the address.
     #[must_use]
     pub const fn from(&self) -> SocketAddr {
-        self.from
+        self.address.last()
     }
 
     /// Returns the time since the last heartbeat.
@@ -232,13 +234,13 @@ impl Redundancy {
 
     /// Returns whether the address belongs to another bridge of the space.
     pub(crate) fn is_peer(&self, from: SocketAddr) -> bool {
-        self.peers.iter().any(|peer| peer.from == from)
+        self.peers.iter().any(|peer| peer.from() == from)
     }
 
     /// Returns whether the address belongs to the followed active bridge.
     pub(crate) fn is_followed(&self, from: SocketAddr) -> bool {
         let followed = |peer: &RedundantPeer| {
-            peer.from == from && Some(peer.heartbeat.instance) == self.followed
+            peer.from() == from && Some(peer.heartbeat.instance) == self.followed
         };
         self.role != Role::Active && self.peers.iter().any(followed)
     }
@@ -375,6 +377,14 @@ impl Redundancy {
         self.deadline = now.monotonic + self.rank.listening();
         let was_active = self.role == Role::Active;
         was_active.then(|| self.mute(MuteCause::NoKeys, self.rank.listening(), now))
+    }
+
+    /// Returns whether a heartbeat has the instance of another bridge, which sends from another
+    /// address. Only for groups in which any sender can send heartbeats.
+    pub(crate) fn is_forged(&self, heartbeat: &Heartbeat, from: SocketAddr, now: Instant) -> bool {
+        let mut peers = self.peers.iter();
+        let known = peers.find(|peer| peer.heartbeat.instance == heartbeat.instance);
+        known.is_some_and(|peer| peer.address.is_forged(from, now))
     }
 
     /// Handles the heartbeat of another bridge of the space.
@@ -542,14 +552,11 @@ impl Redundancy {
 
     /// Records a peer. Returns its heartbeat before.
     fn meet(&mut self, heartbeat: Heartbeat, from: SocketAddr, now: Instant) -> Option<Heartbeat> {
-        let peer = RedundantPeer {
-            heartbeat,
-            from,
-            heard: now,
-        };
         let known = |peer: &&mut RedundantPeer| peer.heartbeat.instance == heartbeat.instance;
         if let Some(known) = self.peers.iter_mut().find(known) {
-            return Some(std::mem::replace(known, peer).heartbeat);
+            known.address.note(from, now);
+            known.heard = now;
+            return Some(std::mem::replace(&mut known.heartbeat, heartbeat));
         }
         self.peers.retain(|peer| peer.age(now) < FORGOTTEN);
         if self.peers.len() >= MOST_PEERS {
@@ -558,7 +565,11 @@ impl Redundancy {
                 self.peers.remove(oldest);
             }
         }
-        self.peers.push(peer);
+        self.peers.push(RedundantPeer {
+            heartbeat,
+            address: SenderAddress::new(from, now),
+            heard: now,
+        });
         None
     }
 }

@@ -778,6 +778,50 @@ fn a_late_message_of_the_former_bridge_is_dropped_by_readers_of_heartbeats() {
 }
 
 #[test]
+fn a_heartbeat_in_the_name_of_a_bridge_from_another_address_changes_no_role() {
+    let mut world = World::new(CELL, 1);
+    world.run(700);
+    let now = world.now(A);
+    world.programs[A].router.switch_over(now).unwrap();
+    world.programs[B].socket.clear();
+    world.drain(A);
+    let mut sent = world.programs[B].socket.iter().map(|(.., bytes)| bytes);
+    let released = sent.find(|bytes| NetworkMessage::decode(bytes).unwrap().group().is_none());
+    let released = released.unwrap().clone();
+
+    let mut world = World::new(CELL, 1);
+    world.run(700);
+    let forger = SocketAddr::from(([127, 0, 0, 1], 9));
+    for _ in 0..20 {
+        for at in [B, READER] {
+            let arrival = (world.passed + 1, forger, released.clone());
+            world.programs[at].socket.push(arrival);
+        }
+        world.run(10);
+    }
+    assert_eq!(
+        (world.role(A), world.role(B)),
+        (Role::Active, Role::Standby)
+    );
+    for at in [B, READER] {
+        assert_eq!(world.dropped(at, Reason::Forged), 20, "at {at}");
+    }
+    let takeovers = |world: &World| world.programs[B].router.redundancy().unwrap().counts();
+    assert_eq!(takeovers(&world).takeovers, 0);
+
+    // The interface of the active bridge gets another address.
+    world.programs[A].address.set_port(9_999);
+    let source = world.programs[A].address;
+    world.programs[A].router.set_source(source);
+    world.run(1_000);
+    assert_eq!(
+        (world.role(A), world.role(B)),
+        (Role::Active, Role::Standby)
+    );
+    assert_eq!(takeovers(&world).takeovers, 0);
+}
+
+#[test]
 fn a_planned_switch_and_the_end_of_a_program_lose_less_than_a_loss() {
     let mut world = World::new(CELL, 6);
     world.run(700);

@@ -127,8 +127,26 @@ impl Roles<'_> {
         }
         // In space 0, other programs share the space with redundant servers.
         let is_shared = self.values.redundant.is_none() && self.values.owned != Owned::All;
-        if space != self.values.settings.own || is_shared {
-            let at = (from, now.monotonic);
+        let is_other = space != self.values.settings.own || is_shared;
+        let at = (from, now.monotonic);
+        let is_forged = !self.security.is_authentic()
+            && match is_other {
+                true => self.senders.is_forged(space, &heartbeat, at),
+                false => {
+                    let state = self.values.redundancy();
+                    state.is_some_and(|state| state.is_forged(&heartbeat, from, now.monotonic))
+                }
+            };
+        if is_forged {
+            let cause = (Reason::Forged, "heartbeat");
+            self.values.count(About::sender(from), cause, 1, || {
+                format!(
+                    "its heartbeat has the instance of a bridge of space {space} that sends from another address"
+                )
+            });
+            return true;
+        }
+        if is_other {
             self.senders.meet(space, heartbeat, at);
             return true;
         }

@@ -10,7 +10,7 @@ use super::about::About;
 use super::security::Security;
 use super::values::Values;
 use crate::counters::Reason;
-use crate::redundancy::Heartbeat;
+use crate::redundancy::{Heartbeat, SenderAddress};
 use crate::settings::Now;
 
 /// The redundant bridges of other spaces.
@@ -26,10 +26,22 @@ struct ActiveSender {
     from: SocketAddr,
     at: Instant,
     /// The addresses of all bridges of the space, by instance.
-    members: BTreeMap<u32, SocketAddr>,
+    members: BTreeMap<u32, SenderAddress>,
 }
 
 impl RedundantSenders {
+    /// Returns whether a heartbeat has the instance of a bridge that sends from another address.
+    pub(super) fn is_forged(
+        &self,
+        space: SpaceId,
+        heartbeat: &Heartbeat,
+        (from, at): (SocketAddr, Instant),
+    ) -> bool {
+        let sender = self.of.get(&space);
+        let member = sender.and_then(|sender| sender.members.get(&heartbeat.instance()));
+        member.is_some_and(|member| member.is_forged(from, at))
+    }
+
     /// Records the heartbeat of a bridge of another space.
     pub(super) fn meet(
         &mut self,
@@ -43,10 +55,14 @@ impl RedundantSenders {
             at,
             members: BTreeMap::new(),
         });
-        if sender.members.len() >= MOST_MEMBERS {
+        let is_known = sender.members.contains_key(&heartbeat.instance());
+        if !is_known && sender.members.len() >= MOST_MEMBERS {
             sender.members.clear();
         }
-        sender.members.insert(heartbeat.instance(), from);
+        let member = sender.members.entry(heartbeat.instance());
+        member
+            .or_insert_with(|| SenderAddress::new(from, at))
+            .note(from, at);
         let same = sender.heartbeat.instance() == heartbeat.instance();
         let before = sender.heartbeat.precedence();
         let stale = at.saturating_duration_since(sender.at) >= SENDER_LOST;
@@ -72,7 +88,7 @@ impl RedundantSenders {
             && now.monotonic.saturating_duration_since(sender.at) < SENDER_LOST;
         let is_superseded = is_known
             && sender.from != from
-            && sender.members.values().any(|member| *member == from);
+            && sender.members.values().any(|member| member.last() == from);
         if is_superseded {
             let active = sender.from;
             let cause = (Reason::Takeover, "superseded");
