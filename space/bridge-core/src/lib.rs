@@ -73,8 +73,8 @@ pub use late::is_aged;
 pub use loop_rule::{Owned, Side, What, may_cross};
 pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey, Unsent};
 pub use redundancy::{
-    Heartbeat, MuteCause, Rank, Redundancy, RedundancyCounts, RedundantPeer, Role, RoleChange,
-    SwitchRefusal, Takeover, TakeoverCause,
+    Heartbeat, LocalSide, MuteCause, Rank, Redundancy, RedundancyCounts, RedundantPeer, Role,
+    RoleChange, SwitchRefusal, Takeover, TakeoverCause,
 };
 pub use room::Room;
 pub use router::{MutedSamples, Router};

@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 pub(crate) use self::address::SenderAddress;
 pub(crate) use self::clocks::{SenderClocks, SentAt};
 pub use self::heartbeat::Heartbeat;
-pub use self::role::{MuteCause, Rank, Role, RoleChange, SwitchRefusal, TakeoverCause};
+pub use self::role::{LocalSide, MuteCause, Rank, Role, RoleChange, SwitchRefusal, TakeoverCause};
 use crate::settings::Now;
 
 /// Another bridge of the space.
@@ -113,7 +113,7 @@ pub struct Redundancy {
     instance: u32,
     role: Role,
     epoch: u32,
-    is_fit: bool,
+    side: LocalSide,
     /// The ServiceLevel of this OPC UA server.
     service_level: Option<u8>,
     /// The number of heartbeats with a ROS side out of reach.
@@ -152,7 +152,7 @@ impl Redundancy {
             instance,
             role: Role::Starting,
             epoch: 0,
-            is_fit: true,
+            side: LocalSide::Reached,
             service_level: None,
             unfit: 0,
             is_released: false,
@@ -274,8 +274,8 @@ impl Redundancy {
     }
 
     /// Sets whether the ROS side is within reach.
-    pub const fn set_fit(&mut self, is_fit: bool) {
-        self.is_fit = is_fit;
+    pub const fn set_side(&mut self, side: LocalSide) {
+        self.side = side;
     }
 
     /// Sets the ServiceLevel of this OPC UA server, which its heartbeats carry.
@@ -344,7 +344,7 @@ impl Redundancy {
             role: self.role,
             epoch: self.epoch,
             instance: self.instance,
-            is_fit: self.is_fit,
+            is_fit: self.side.is_reached(),
             is_released: self.is_released,
             service_level: self.service_level,
         }
@@ -506,12 +506,16 @@ impl Redundancy {
 
     /// Hands over if the ROS side is out of reach and a standby reaches it.
     fn look_at_sides(&mut self, now: Now) -> Option<RoleChange> {
-        self.unfit = if self.is_fit {
-            0
-        } else {
-            self.unfit.saturating_add(1)
+        let patience = match self.side {
+            LocalSide::Reached => {
+                self.unfit = 0;
+                return None;
+            }
+            LocalSide::Silent => UNFIT,
+            LocalSide::NoLink => UNLINKED,
         };
-        let hands_over = self.unfit >= UNFIT && self.has_standby(true, now.monotonic);
+        self.unfit = self.unfit.saturating_add(1);
+        let hands_over = self.unfit >= patience && self.has_standby(true, now.monotonic);
         hands_over.then(|| self.release(MuteCause::Unfit, now))
     }
 
@@ -593,8 +597,11 @@ const TOLERATED: Duration = Duration::from_millis(30);
 /// The time by which a takeover is deferred while messages wait, and the longest such time.
 const DEFERRED: Duration = Duration::from_millis(2);
 const LONGEST_DEFERRAL: Duration = Duration::from_secs(1);
-/// The number of heartbeats for which the ROS side is out of reach before a bridge hands over.
+/// The number of heartbeats for which the ROS side is silent before a bridge hands over.
 const UNFIT: u32 = 25;
+/// The number of heartbeats without a link before a bridge hands over: time for a standby at the
+/// same switch to report that it has no link either.
+const UNLINKED: u32 = 4;
 /// The longest stall after which a bridge without peers resumes at once. A bridge listens longer
 /// at its start.
 const ALONE: Duration = Duration::from_millis(200);

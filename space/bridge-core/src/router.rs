@@ -91,7 +91,7 @@ use crate::tap::{Crossing, Tapped};
 ///   [`set_arrival`](Self::set_arrival), [`set_instance`](Self::set_instance),
 ///   [`set_keys`](Self::set_keys), [`tap`](Self::tap).
 /// - redundancy: [`set_redundancy`](Self::set_redundancy),
-///   [`show_values_at_standby`](Self::show_values_at_standby), [`set_fit`](Self::set_fit),
+///   [`show_values_at_standby`](Self::show_values_at_standby), [`set_side`](Self::set_side),
 ///   [`switch_over`](Self::switch_over).
 ///
 /// # Outputs

@@ -146,6 +146,7 @@ impl<P: Port> Shell<P> {
         let mut stop = pin!(stop);
         let mut timer = pin!(tokio::time::sleep(FAR));
         let mut looks = pin!(tokio::time::sleep(Duration::ZERO));
+        let mut links = pin!(tokio::time::sleep(Duration::ZERO));
         let mut buffer = vec![0; BUFFER];
         let mut more = false;
         loop {
@@ -164,6 +165,11 @@ impl<P: Port> Shell<P> {
                 () = &mut stop => return Ok(()),
                 heard = self.carrier.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
                 event = self.port.recv() => more = self.port_events(event).await?,
+                () = links.as_mut(), if self.watches_links() => {
+                    links.as_mut().reset(TokioInstant::now() + redundancy::LINK_LOOK);
+                    self.look_at_held()?;
+                    self.look_at_fitness();
+                }
                 () = timer.as_mut() => {
                     self.read_waiting(&mut buffer);
                     self.router.handle_timeout(now());

@@ -72,6 +72,23 @@ impl Role {
     }
 }
 
+/// The state of the ROS side of a redundant bridge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LocalSide {
+    /// It is within reach.
+    Reached,
+    /// It does not respond, such as a ROS 1 master.
+    Silent,
+    /// The network interface has no link.
+    NoLink,
+}
+
+impl LocalSide {
+    pub(super) const fn is_reached(self) -> bool {
+        matches!(self, Self::Reached)
+    }
+}
+
 /// The cause of a takeover.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TakeoverCause {

@@ -337,16 +337,38 @@ fn a_planned_switch_is_shorter_than_a_loss() {
 fn a_bridge_without_its_ros_side_hands_over_only_to_a_bridge_that_has_it() {
     let mut network = Network::new(&[1, 2], 3);
     network.run(700);
-    network.bridges[0].state.set_fit(false);
-    network.bridges[1].state.set_fit(false);
+    network.bridges[0].state.set_side(LocalSide::Silent);
+    network.bridges[1].state.set_side(LocalSide::Silent);
     network.run(2_000);
     assert_eq!(network.active(), [0], "neither reaches the ROS side");
-    network.bridges[1].state.set_fit(true);
+    network.bridges[1].state.set_side(LocalSide::Reached);
     network.run(1_000);
     assert_eq!(network.active(), [1]);
-    network.bridges[0].state.set_fit(true);
+    network.bridges[0].state.set_side(LocalSide::Reached);
     network.run(1_000);
     assert_eq!(network.active(), [1], "it does not return by itself");
+}
+
+#[test]
+fn a_bridge_without_a_link_to_its_ros_side_hands_over_soon_unless_the_standby_has_none_either() {
+    let mut network = Network::new(&[1, 2], 3);
+    network.run(700);
+    network.bridges[0].state.set_side(LocalSide::NoLink);
+    // The standby looks later.
+    network.run(25);
+    network.bridges[1].state.set_side(LocalSide::NoLink);
+    network.run(2_000);
+    assert_eq!(network.active(), [0], "the switch of both is down");
+    network.bridges[1].state.set_side(LocalSide::Reached);
+    network.run(150);
+    assert_eq!(network.active(), [1]);
+    network.assert_one_sender();
+    // The time from the loss of the link to the takeover.
+    network.bridges[0].state.set_side(LocalSide::Reached);
+    network.run(1_000);
+    network.bridges[1].state.set_side(LocalSide::NoLink);
+    network.run(150);
+    assert_eq!(network.active(), [0]);
 }
 
 #[test]

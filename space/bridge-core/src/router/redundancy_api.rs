@@ -5,7 +5,7 @@ use std::time::Instant;
 use super::Router;
 use super::redundant::{MutedSamples, Redundant};
 use super::roles::Roles;
-use crate::redundancy::{Rank, Redundancy, SwitchRefusal};
+use crate::redundancy::{LocalSide, Rank, Redundancy, SwitchRefusal};
 use crate::settings::Now;
 
 impl Router {
@@ -80,9 +80,9 @@ impl Router {
     }
 
     /// Sets whether the local side is within reach.
-    pub fn set_fit(&mut self, is_fit: bool) {
+    pub fn set_side(&mut self, side: LocalSide) {
         if let Some(redundant) = &mut self.values.redundant {
-            redundant.set_fit(is_fit);
+            redundant.set_side(side);
         }
     }
 

@@ -15,7 +15,7 @@ use self::succession::Succession;
 use crate::output::{Delivery, Kept};
 use crate::place::Place;
 use crate::redundancy::{
-    Heartbeat, Rank, Redundancy, RoleChange, SenderClocks, SwitchRefusal, TakeoverCause,
+    Heartbeat, LocalSide, Rank, Redundancy, RoleChange, SenderClocks, SwitchRefusal, TakeoverCause,
 };
 use crate::settings::Now;
 use crate::writer::{MAX_KEPT, Writer};
@@ -103,8 +103,8 @@ impl Redundant {
     }
 
     /// Sets whether the local side is within reach.
-    pub(super) const fn set_fit(&mut self, is_fit: bool) {
-        self.state.set_fit(is_fit);
+    pub(super) const fn set_side(&mut self, side: LocalSide) {
+        self.state.set_side(side);
     }
 
     /// Sets the ServiceLevel of this OPC UA server.

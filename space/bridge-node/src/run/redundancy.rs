@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use bridge_core::{MuteCause, Rank, RoleChange, TakeoverCause};
+use bridge_core::{LocalSide, MuteCause, Rank, RoleChange, TakeoverCause};
 use mappings::Mapping;
 use tracing::{error, info, warn};
 use transport::{Held, Outgoing};
@@ -85,6 +85,12 @@ impl<P: Port> Shell<P> {
         }
     }
 
+    /// Returns whether the links of the ROS side are checked every [`LINK_LOOK`], so that a bridge
+    /// that lost its link hands over within the time of a takeover.
+    pub(super) fn watches_links(&self) -> bool {
+        self.held.is_some() && self.router.redundancy().is_some()
+    }
+
     /// Sets whether the ROS side is within reach.
     pub(super) fn look_at_fitness(&mut self) {
         if self.router.redundancy().is_none() {
@@ -94,8 +100,12 @@ impl<P: Port> Shell<P> {
             .held
             .as_ref()
             .is_none_or(|held| Held::lost(held).is_none());
-        let is_fit = is_held && self.port.hindrance().is_none();
-        self.router.set_fit(is_fit);
+        let side = match (is_held, self.port.hindrance()) {
+            (false, _) => LocalSide::NoLink,
+            (true, Some(_)) => LocalSide::Silent,
+            (true, None) => LocalSide::Reached,
+        };
+        self.router.set_side(side);
         self.router.set_service_level(self.port.service_level());
     }
 
@@ -154,5 +164,8 @@ fn tell_same_rank(rank: Option<u8>, from: SocketAddr) {
     error!(rank, other = %from, "another bridge has the same rank; give one of them another --rank");
 }
 
+/// The interval in which redundant bridges check the links of the ROS side. Listing the interfaces
+/// takes less than 0.1 ms.
+pub(super) const LINK_LOOK: Duration = Duration::from_millis(25);
 /// The maximum number of datagrams that are handled in a row before a takeover.
 const READ_AT_ONCE: usize = 256;
