@@ -44,8 +44,7 @@ impl Segment {
     /// Panics if the host has an interface with this name.
     pub fn plug(&self, site: &Site, interface: &str, address: &str) {
         let Self(here) = self;
-        // Interface names are at most 15 characters and have to be unique in this namespace.
-        let end = format!("p{}", address.replace('.', "-"));
+        let end = end_of(address);
         let path = site.path();
         let path = path.to_string_lossy();
         here.ip(&[
@@ -66,9 +65,35 @@ impl Segment {
     /// # Panics
     /// Panics if no host is connected with this address.
     pub fn pull(&self, address: &str) {
-        let end = format!("p{}", address.replace('.', "-"));
-        self.0.ip(&["link", "delete", &end]);
+        self.0.ip(&["link", "delete", &end_of(address)]);
     }
+
+    /// Takes away or returns the link of the host with this address. Its interface stays.
+    ///
+    /// # Panics
+    /// Panics if no host is connected with this address.
+    pub fn set_link(&self, address: &str, is_up: bool) {
+        let state = if is_up { "up" } else { "down" };
+        self.0.ip(&["link", "set", &end_of(address), state]);
+    }
+
+    /// Cuts the host with this address off, or ends it. The host keeps its link.
+    ///
+    /// # Panics
+    /// Panics if no host is connected with this address.
+    pub fn set_cut_off(&self, address: &str, is_cut_off: bool) {
+        let end = end_of(address);
+        match is_cut_off {
+            true => self.0.ip(&["link", "set", &end, "nomaster"]),
+            false => self.0.ip(&["link", "set", &end, "master", BRIDGE]),
+        }
+    }
+}
+
+/// Returns the name of the end of a cable in the network. Names of interfaces have at most 15
+/// characters and are unique.
+fn end_of(address: &str) -> String {
+    format!("p{}", address.replace('.', "-"))
 }
 
 impl Site {

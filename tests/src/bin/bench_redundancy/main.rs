@@ -1,20 +1,21 @@
 //! `cargo xtask bench redundancy`: random faults of two redundant bridges at 1000 values a second.
 //!
 //! rospy publishes numbers, two bridges of ROS 1 with the ranks 1 and 2 share the space, and a
-//! subscriber in the group records each number with its arrival. The active bridge is killed,
-//! stopped for a random time, cut off from the group, or asked to hand over, in a random order. The
-//! gap of a fault is the longest time without a new number from the fault on.
+//! subscriber in the group records each number with its arrival. The bridges and the station with
+//! the publisher and the subscriber are hosts at two networks, that of the group and that of ROS.
+//! The active bridge is killed, stopped for a random time, cut off from a network, or asked to hand
+//! over, in a random order. The gap of a fault is the longest time without a new number from the
+//! fault on.
 
 mod network;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::net::Ipv4Addr;
 use std::process::ExitCode;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
-use system_tests::{Cell, Child, GroupNumbers, Peer, Started, eventually, metrics, program};
+use system_tests::{Cell, Child, Peer, eventually};
 
 use network::Network;
 
@@ -23,7 +24,8 @@ fn main() -> ExitCode {
     match args.first().map(String::as_str) {
         Some("--help" | "-h") => {
             println!(
-                "bench-redundancy [FAULTS [SEED]]   faults of the active bridge, 200 unless told, about 3 s each"
+                "bench-redundancy [FAULTS [SEED]]   faults of the active bridge, 200 unless told, about 3 s each, \
+                 for at most 10 minutes"
             );
             ExitCode::SUCCESS
         }
@@ -43,14 +45,16 @@ enum Fault {
     Killed,
     Stopped,
     CutOff,
+    RosCut,
     SwitchedOver,
 }
 
 impl Fault {
-    const ALL: [Self; 4] = [
+    const ALL: [Self; 5] = [
         Self::Killed,
         Self::Stopped,
         Self::CutOff,
+        Self::RosCut,
         Self::SwitchedOver,
     ];
 
@@ -59,6 +63,7 @@ impl Fault {
             Self::Killed => "kill -9",
             Self::Stopped => "SIGSTOP, SIGCONT after 0.2 to 1.5 s",
             Self::CutOff => "group cut off for 0.3 to 1.5 s",
+            Self::RosCut => "link to ROS down for 0.3 to 1.5 s",
             Self::SwitchedOver => "planned switch-over",
         }
     }
@@ -84,46 +89,43 @@ impl Random {
     }
 }
 
-/// Two bridges with an interface each.
+/// Two bridges on their hosts.
 struct Pair<'c> {
     cell: &'c Cell,
+    network: &'c Network,
     mapping: String,
     bridges: [Option<Child>; 2],
 }
 
 impl<'c> Pair<'c> {
-    fn start(cell: &'c Cell) -> Self {
+    fn start(cell: &'c Cell, network: &'c Network) -> Self {
         let mapping = cell.file("cell.yaml", MAPPING);
         let mut pair = Self {
             cell,
+            network,
             mapping: mapping.to_str().unwrap().to_owned(),
             bridges: [None, None],
         };
         for at in 0..2 {
-            pair.bridges[at] = Some(pair.bridge(at).start());
+            pair.launch(at);
         }
         pair
     }
 
-    fn bridge(&self, at: usize) -> Started {
-        let rank = ["1", "2"][at];
-        let interface = network::BRIDGES[at].name;
-        self.cell
-            .with_ros1(Started::new("bridge-ros1", &program("bridge-ros1")))
-            .args([&self.mapping])
-            .args(["--rank", rank, "--interface", interface])
-            .args(["--metrics", METRICS[at]])
+    fn launch(&mut self, at: usize) {
+        let started = self.network.bridge(self.cell, at, &self.mapping);
+        self.bridges[at] = Some(started.start());
     }
 
-    fn role(at: usize) -> Option<String> {
-        let role = &metrics(METRICS[at])?["redundancy"]["role"];
+    fn role(&self, at: usize) -> Option<String> {
+        let role = &self.network.status(at)?["redundancy"]["role"];
         role.as_str().map(str::to_owned)
     }
 
     /// Waits until a bridge is active and the other is its standby. Returns the active bridge.
     fn settled(&self) -> usize {
         eventually("one bridge is active, the other is standby", SOON, || {
-            let roles = [Self::role(0)?, Self::role(1)?];
+            let roles = [self.role(0)?, self.role(1)?];
             match [&roles[0][..], &roles[1][..]] {
                 ["active", "standby"] => Some(0),
                 ["standby", "active"] => Some(1),
@@ -133,17 +135,17 @@ impl<'c> Pair<'c> {
     }
 
     /// Returns the number of values of the topic that a bridge received from ROS.
-    fn received(at: usize) -> Option<u64> {
-        let status = metrics(METRICS[at])?;
+    fn received(&self, at: usize) -> Option<u64> {
+        let status = self.network.status(at)?;
         let sent = status["topics"]["ua_1_2_12"]["sent"].as_u64()?;
         Some(sent + status["redundancy"]["muted_sent"].as_u64()?)
     }
 
     /// Waits until a bridge receives values, which a restarted bridge does after it is a standby.
-    fn wait_for_values(at: usize) {
-        let before = Self::received(at).unwrap_or_default();
+    fn wait_for_values(&self, at: usize) {
+        let before = self.received(at).unwrap_or_default();
         eventually("the standby receives the topic", SOON, || {
-            (Self::received(at)? > before + 20).then_some(())
+            (self.received(at)? > before + 20).then_some(())
         });
     }
 
@@ -156,20 +158,25 @@ fn bench(faults: u64, seed: u64) -> ExitCode {
     let Some(cell) = Cell::with(&[Peer::Ros1]) else {
         return ExitCode::FAILURE;
     };
-    let network = Network::lay();
-    let _master = cell.roscore();
-    let mut pair = Pair::start(&cell);
+    let network = Network::lay(&cell);
+    let _master = network.master(&cell);
+    eventually("the master of ROS responds", SOON, || {
+        network.has_master().then_some(())
+    });
+    let mut pair = Pair::start(&cell, &network);
     pair.settled();
-    let numbers = GroupNumbers::of((1, 2, 12), network::READER);
-    let count = (faults * 10_000 + 60_000).to_string();
+    let numbers = network.numbers((1, 2, 12));
+    let seconds = (faults * 10).min(LONGEST.as_secs()) + 120;
+    let (count, limit) = ((seconds * 1000).to_string(), (seconds + 300).to_string());
     let args = ["/numbers", "std_msgs/String", "--rate", "1000"];
-    let mut publisher = cell
-        .rospy_started("ros1_pub.py", &args)
-        .args(["--numbered", &count, "--warm-up", "\"warm-up\""])
+    let mut publisher = network
+        .publisher(&cell, &args)
+        .args(["--numbered", &count, "--limit", &limit])
+        .args(["--warm-up", "\"warm-up\""])
         .told()
         .start();
     eventually("both bridges receive the topic", SOON, || {
-        let receives = |at: usize| Pair::received(at).map(|received| received > 3);
+        let receives = |at: usize| pair.received(at).map(|received| received > 3);
         ([0, 1].map(receives) == [Some(true); 2]).then_some(())
     });
     publisher.tell("go");
@@ -179,20 +186,25 @@ fn bench(faults: u64, seed: u64) -> ExitCode {
     let (mut arrivals, mut unsettled) = (Vec::new(), 0);
     let cores = std::thread::available_parallelism().map_or(0, usize::from);
     println!("{faults} random faults of the active bridge at 1 kHz, seed {seed}, {cores} cores\n");
+    let start = Instant::now();
+    let all = u64::try_from(Fault::ALL.len()).unwrap();
     for turn in 0..faults {
+        if start.elapsed() >= LONGEST {
+            println!("ended after {turn} faults, because {LONGEST:?} have passed\n");
+            break;
+        }
         let active = pair.settled();
-        Pair::wait_for_values(1 - active);
-        sleep(Duration::from_millis(300 + random.below(300)));
-        if Pair::role(active).as_deref() != Some("active") {
+        pair.wait_for_values(1 - active);
+        sleep(Duration::from_millis(100 + random.below(300)));
+        if pair.role(active).as_deref() != Some("active") {
             // A busy machine has changed the roles meanwhile.
             unsettled += 1;
             continue;
         }
-        // Each fault is as frequent as the others.
-        let fault = Fault::ALL[usize::try_from((turn + random.below(4)) % 4).unwrap()];
+        let fault = Fault::ALL[usize::try_from((turn + random.below(all)) % all).unwrap()];
         let at = Instant::now();
-        strike(&mut pair, (active, fault), &network, &mut random);
-        sleep(Duration::from_millis(500));
+        strike(&mut pair, (active, fault), &mut random);
+        sleep(Duration::from_millis(300));
         let end = Instant::now();
         done.push(Done { fault, at, end });
         arrivals.extend(numbers.take());
@@ -206,19 +218,14 @@ fn bench(faults: u64, seed: u64) -> ExitCode {
     report(&done, &arrivals, unsettled)
 }
 
-fn strike(
-    pair: &mut Pair<'_>,
-    (active, fault): (usize, Fault),
-    network: &Network,
-    random: &mut Random,
-) {
+fn strike(pair: &mut Pair<'_>, (active, fault): (usize, Fault), random: &mut Random) {
     match fault {
         Fault::Killed => {
             let mut child = pair.bridges[active].take().unwrap();
             child.signal(Signal::SIGKILL);
             child.wait_for_end(SOON);
-            sleep(Duration::from_millis(500));
-            pair.bridges[active] = Some(pair.bridge(active).start());
+            sleep(Duration::from_millis(300));
+            pair.launch(active);
         }
         Fault::Stopped => {
             pair.child(active).signal(Signal::SIGSTOP);
@@ -226,9 +233,14 @@ fn strike(
             pair.child(active).signal(Signal::SIGCONT);
         }
         Fault::CutOff => {
-            network.cut(active);
+            pair.network.set_group_cut(active, true);
             sleep(Duration::from_millis(300 + random.below(1_200)));
-            network.mend(active);
+            pair.network.set_group_cut(active, false);
+        }
+        Fault::RosCut => {
+            pair.network.set_ros_cut(active, true);
+            sleep(Duration::from_millis(300 + random.below(1_200)));
+            pair.network.set_ros_cut(active, false);
         }
         Fault::SwitchedOver => pair.child(active).signal(Signal::SIGUSR1),
     }
@@ -256,6 +268,7 @@ fn report(done: &[Done], arrivals: &[(Instant, u32)], unsettled: u64) -> ExitCod
         row(fault.name(), gaps);
     }
     row("all", &mut all);
+    distribution(&all);
     let mut seen = BTreeSet::new();
     let (mut doubled, mut disordered, mut last) = (0, 0, None);
     for (_, number) in arrivals {
@@ -296,16 +309,38 @@ fn row(name: &str, gaps: &mut [f64]) {
     );
 }
 
+/// Prints the number of faults by the length of their gap.
+fn distribution(gaps: &[f64]) {
+    println!("\n| gap | faults |");
+    println!("|---|---|");
+    let mut from = 0.0;
+    for to in [
+        25.0,
+        50.0,
+        75.0,
+        100.0,
+        125.0,
+        150.0,
+        300.0,
+        1000.0,
+        f64::INFINITY,
+    ] {
+        let count = gaps.iter().filter(|gap| (from..to).contains(*gap)).count();
+        if to.is_finite() {
+            println!("| {from:.0} to {to:.0} ms | {count} |");
+        } else {
+            println!("| longer | {count} |");
+        }
+        from = to;
+    }
+}
+
 const MAPPING: &str = "
 spaces: [{id: 1}]
 namespaces: {2: urn:plant}
 variables:
   - {node: ns=2;i=12, name: Numbers, origin: 1, queue: {drop_oldest: 1000}, ros: {topic: /numbers, type: std_msgs/String}}
 ";
-const METRICS: [&str; 2] = ["127.0.0.1:9101", "127.0.0.1:9112"];
 const SOON: Duration = Duration::from_secs(60);
-
-/// The address of an interface.
-pub(crate) const fn address(last: u8) -> Ipv4Addr {
-    Ipv4Addr::new(10, 78, 0, last)
-}
+/// The time after which no further fault is caused.
+const LONGEST: Duration = Duration::from_secs(570);
