@@ -8,7 +8,7 @@
 //! - Values, commands, requests and responses are never retained, sessions end with the
 //!   connection, and with MQTT 5 messages expire. Nothing is queued for an absent reader.
 //! - A message waits at most its time in the own queue. While the broker is away, only the newest
-//!   state of each topic waits.
+//!   state of each topic waits, and older states that the broker confirms (QoS 1).
 //! - A broker that does not answer for [`STALL`] is left with a reset, which discards the messages
 //!   that it has not read.
 //! - The receiver has to drop late messages; see [`Carrier::within`](transport::Carrier::within).

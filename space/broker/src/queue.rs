@@ -13,7 +13,8 @@ pub(crate) struct QueuedPublish {
     pub(crate) retained: bool,
     /// Whether the broker confirms the message (QoS 1).
     pub(crate) confirmed: bool,
-    /// Whether a newer message of the topic replaces the message.
+    /// Whether a newer message of the topic replaces the message. A [series](Self::is_series) is
+    /// replaced only if the queue is full.
     pub(crate) replaceable: bool,
     /// Whether the newest message of the topic waits for the next connection if the broker is lost:
     /// a state, but no command.
@@ -24,6 +25,14 @@ pub(crate) struct QueuedPublish {
     pub(crate) message_type: &'static str,
     /// Content Type of MQTT 5.
     pub(crate) content_type: &'static str,
+}
+
+impl QueuedPublish {
+    /// Returns whether each message of the topic is to arrive in its time, and not the newest only:
+    /// a state that the broker confirms. The broker may confirm nothing for seconds.
+    const fn is_series(&self) -> bool {
+        self.confirmed && self.outlasts
+    }
 }
 
 /// A message and the time at which it expires.
@@ -53,6 +62,7 @@ impl SendQueue {
     ) -> Result<(), SendError> {
         let until = publication.within.map(|within| now + within);
         if publication.replaceable
+            && !publication.is_series()
             && let Some((older, of)) = self
                 .waiting
                 .iter_mut()
@@ -63,12 +73,46 @@ impl SendQueue {
             self.replaced += 1;
             return Ok(());
         }
-        if !self.has_room(&publication) {
+        if !self.make_room(&publication) {
             return Err(SendError::Busy);
         }
         self.bytes += publication.payload.len();
         self.waiting.push_back((publication, until));
         Ok(())
+    }
+
+    /// Makes room for a message: the oldest states leave the queue, of which newer states wait.
+    /// Returns whether the message fits.
+    fn make_room(&mut self, publication: &QueuedPublish) -> bool {
+        if self.has_room(publication) {
+            return true;
+        }
+        let mut superseded = self.superseded(publication);
+        let mut removed = 0;
+        while !self.has_room(publication) {
+            let Some(oldest) = superseded.pop() else {
+                return false;
+            };
+            let older = self.waiting.remove(oldest - removed);
+            let bytes = older.map_or(0, |(of, _)| of.payload.len());
+            self.bytes = self.bytes.saturating_sub(bytes);
+            removed += 1;
+            self.replaced += 1;
+        }
+        true
+    }
+
+    /// Returns the places of the states of which a newer state waits or is `next`, the oldest last.
+    fn superseded(&self, next: &QueuedPublish) -> Vec<usize> {
+        let next = next.is_series().then_some(next.topic.as_str());
+        let mut newer: BTreeSet<&str> = next.into_iter().collect();
+        let mut superseded = Vec::new();
+        for (at, (publication, _)) in self.waiting.iter().enumerate().rev() {
+            if publication.is_series() && !newer.insert(&publication.topic) {
+                superseded.push(at);
+            }
+        }
+        superseded
     }
 
     /// Returns the next message that has not expired. Messages to be confirmed stay while
@@ -96,7 +140,8 @@ impl SendQueue {
     }
 
     /// Discards the messages of a lost connection: they would be late after a reconnection. The
-    /// newest state of each topic waits for the next connection until it expires. `in_flight` are
+    /// newest state of each topic waits for the next connection until it expires, and so do older
+    /// states that the broker confirms: a reader drops those that it has received. `in_flight` are
     /// the messages without a confirmation, `unwritten` the number of messages that were not
     /// written and need no confirmation.
     pub(crate) fn lose(&mut self, in_flight: Vec<QueuedMessage>, unwritten: usize) {
@@ -110,7 +155,9 @@ impl SendQueue {
             .collect();
         for (is_in_flight, message) in all.into_iter().rev() {
             let publication = &message.0;
-            if publication.outlasts && newest.insert(publication.topic.clone()) {
+            let waits = publication.is_series()
+                || (publication.outlasts && newest.insert(publication.topic.clone()));
+            if waits {
                 self.bytes += publication.payload.len();
                 self.waiting.push_front(message);
                 continue;
@@ -138,7 +185,7 @@ impl SendQueue {
             let _full = self.push(publication.clone(), now).is_err();
         }
         for state in states {
-            if self.has_room(&state.0) {
+            if self.make_room(&state.0) {
                 self.bytes += state.0.payload.len();
                 self.waiting.push_back(state);
             } else {
@@ -230,7 +277,6 @@ mod tests {
     fn state(topic: &str, number: u8, until: Instant) -> QueuedMessage {
         let state = QueuedPublish {
             payload: vec![number],
-            confirmed: true,
             outlasts: true,
             ..publication(topic, Some(1000), true)
         };
@@ -285,11 +331,67 @@ mod tests {
         assert_eq!((queue.expired, queue.unconfirmed), (1, 4));
     }
 
+    /// Returns a state that the broker confirms.
+    fn confirmed(topic: &str, number: u8) -> QueuedPublish {
+        let at = start();
+        QueuedPublish {
+            confirmed: true,
+            ..state(topic, number, at).0
+        }
+    }
+
+    #[test]
+    fn states_that_the_broker_confirms_all_wait_and_are_sent_again_in_their_order() {
+        let mut queue = SendQueue::default();
+        let start = start();
+        for number in 1..=3 {
+            queue.push(confirmed("a", number), start).unwrap();
+        }
+        assert_eq!(queue.replaced, 0);
+        let first = queue.pop(start, true).unwrap();
+        let second = queue.pop(start, true).unwrap();
+        queue.lose(vec![first, second], 0);
+        queue.begin(std::iter::empty(), start);
+        let sent = std::iter::from_fn(|| queue.pop(start, true).map(|of| of.0.payload));
+        assert_eq!(sent.flatten().collect::<Vec<u8>>(), [1, 2, 3]);
+        assert_eq!((queue.unconfirmed, queue.discarded, queue.bytes), (0, 0, 0));
+    }
+
+    #[test]
+    fn of_states_that_the_broker_does_not_confirm_the_oldest_leave_a_full_queue() {
+        let mut queue = SendQueue::default();
+        let start = start();
+        queue.push(confirmed("seldom", 1), start).unwrap();
+        queue
+            .push(publication("event", None, false), start)
+            .unwrap();
+        for _ in 0..MAX_WAITING {
+            queue.push(confirmed("often", 2), start).unwrap();
+        }
+        assert_eq!((queue.waiting.len(), queue.replaced), (MAX_WAITING, 2));
+        queue.push(confirmed("another", 3), start).unwrap();
+        let topics: Vec<&str> = queue.waiting.iter().map(|(of, _)| &of.topic[..]).collect();
+        assert_eq!(topics[..3], ["seldom", "event", "often"]);
+        assert_eq!(topics[MAX_WAITING - 2..], ["often", "another"]);
+        // The bytes are bounded too, and a message that cannot fit is refused.
+        let large = |topic, bytes| QueuedPublish {
+            payload: vec![0; bytes],
+            ..confirmed(topic, 4)
+        };
+        queue.push(large("often", MAX_BYTES / 2), start).unwrap();
+        queue
+            .push(large("often", MAX_BYTES / 2 + 1), start)
+            .unwrap();
+        assert!(queue.bytes <= MAX_BYTES);
+        let refused = queue.push(large("other", MAX_BYTES), start);
+        assert_eq!(refused, Err(SendError::Busy));
+    }
+
     #[test]
     fn a_command_does_not_wait_behind_states_that_the_broker_does_not_confirm() {
         let mut queue = SendQueue::default();
         let start = start();
-        queue.push(state("a", 1, start).0, start).unwrap();
+        queue.push(confirmed("a", 1), start).unwrap();
         queue
             .push(publication("stop", Some(1000), false), start)
             .unwrap();
