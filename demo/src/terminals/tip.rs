@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use devices::ur::Follower;
+use devices::ur::{Follower, RtdeError};
 use skills::frame::Frame;
 use tokio::task::JoinSet;
 
@@ -17,8 +17,8 @@ impl Tip {
     /// Follows the simulated robot by RTDE. The points are in m.
     ///
     /// # Errors
-    /// Returns the reason for users if the robot does not answer.
-    pub(super) async fn follow(points: Vec<[f64; 3]>) -> Result<Self, String> {
+    /// The robot does not answer.
+    pub(super) async fn follow(points: Vec<[f64; 3]>) -> Result<Self, RtdeError> {
         let mut follower = Follower::open(RTDE).await?;
         let nearest = Arc::new(Mutex::new(vec![f64::MAX; points.len()]));
         let mut following = JoinSet::new();

@@ -12,7 +12,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use rustix::process::{Pid, Signal, kill_process_group};
 use serde_json::{Value as Json, json};
-use skills::{Component, Driver, DriverSetup, ExecWork, Results, Value, Work};
+use skills::{Component, Driver, DriverError, DriverSetup, ExecWork, Results, Value, Work};
 use tokio::io::{
     AsyncBufRead, AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader,
 };
@@ -62,8 +62,9 @@ impl Driver for Program {
         Some(self.work.halt_timeout + STOP_WITHIN + ENDS_WITHIN)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
-        let mut child = start(&self.work.command, &self.work.folder, [Stdio::piped; 2])?;
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+        let child = start(&self.work.command, &self.work.folder, [Stdio::piped; 2]);
+        let mut child = child.map_err(DriverError::reported)?;
         let group = group_of(&child);
         let _group = KilledGroup(group);
         let ended = self.follow(&mut child, &work).await;
@@ -71,14 +72,14 @@ impl Driver for Program {
             Ended::Told(result) => {
                 // The result counts; a program that stays is killed with its group.
                 let _ended = timeout(ENDS_WITHIN, child.wait()).await;
-                result
+                result.map_err(DriverError::reported)
             }
             Ended::Unknown(why) => {
                 kill(group);
                 let stopped = self.stop().await;
                 let why = format!("{why}; {stopped}");
                 work.unknown(&why).await;
-                Err(why)
+                Err(DriverError::reported(why))
             }
         }
     }

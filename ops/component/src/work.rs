@@ -12,8 +12,8 @@ use bytes::Bytes;
 use mappings::TopicId;
 use serde_json::Value as Json;
 use skills::{
-    Asked, Builtin, Component, Driver, DriverSetup, Parameters, Results, Shape, SpaceWork, Stopped,
-    Value, Work,
+    Asked, Builtin, Component, Driver, DriverError, DriverSetup, Parameters, Results, Shape,
+    SpaceWork, Stopped, Value, Work,
 };
 use tokio::time::sleep;
 use uadp::Fields;
@@ -61,11 +61,12 @@ impl Driver for SpaceDriver {
         Some(self.work.halt_timeout)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
-        match self.work.asked {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
+        let ended = match self.work.asked {
             Asked::Call => self.call(&work).await,
             Asked::Action => self.act(&work).await,
-        }
+        };
+        ended.map_err(DriverError::reported)
     }
 }
 
@@ -80,7 +81,7 @@ enum NotSent {
 impl SpaceDriver {
     async fn call(&self, work: &Work) -> Result<Results, String> {
         let call = tokio::select! {
-            () = work.stopped() => return Err(Stopped.into()),
+            () = work.stopped() => return Err(Stopped.to_string()),
             call = self.asks.known(self.topic, self.work.within) => call?,
         };
         let request = self.request(&call.request, work.parameters(), None)?;

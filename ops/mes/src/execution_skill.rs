@@ -4,7 +4,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use async_trait::async_trait;
-use skills::{COMPOSITE_HALT_TIMEOUT, Driver, Parameters, Results, Teller, Value, Work};
+use skills::{
+    COMPOSITE_HALT_TIMEOUT, Driver, DriverError, InvalidParameter, Parameters, Results, Teller,
+    Value, Work,
+};
 
 use crate::cell::Cell;
 use crate::execute::{Plant, dry_run, execute};
@@ -38,26 +41,38 @@ impl Driver for ExecuteProcess {
         Some(COMPOSITE_HALT_TIMEOUT)
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
+        let unexpected = |name: &str, given: &str, expected| InvalidParameter::Unexpected {
+            name: name.to_owned(),
+            given: Some(given.into()),
+            expected,
+        };
         let iri = parameters.text("ProcessIri").unwrap_or_default();
         if let Err(why) = self.cell.process(iri) {
-            return Err(format!("ProcessIri: {why}"));
+            return Err(unexpected(
+                "ProcessIri",
+                iri,
+                format!("cannot be used: {why}"),
+            ));
         }
         match parameters.text("ExecutionMode") {
             Some("execute" | "plan") | None => Ok(()),
-            Some(other) => Err(format!(
-                "ExecutionMode: `{other}` is neither execute nor plan"
+            Some(other) => Err(unexpected(
+                "ExecutionMode",
+                other,
+                format!("is `{other}`, which is neither execute nor plan"),
             )),
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let iri = work
             .parameters()
             .text("ProcessIri")
             .unwrap_or_default()
             .to_owned();
-        let process = self.cell.process(&iri)?;
+        let process = self.cell.process(&iri);
+        let process = process.map_err(DriverError::reported)?;
         let report = |report: &serde_json::Value| {
             Ok(vec![(
                 "Report".to_owned(),
@@ -92,7 +107,7 @@ impl Driver for ExecuteProcess {
             (How::Done, _) => report(
                 &serde_json::json!({ "run": run.run, "process": iri, "plans": run.plans.len(), "outcome": "done" }),
             ),
-            (_, reason) => Err(reason.unwrap_or_default()),
+            (_, reason) => Err(DriverError::reported(reason.unwrap_or_default())),
         }
     }
 }

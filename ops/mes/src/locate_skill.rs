@@ -6,7 +6,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use knowledge::{Answer, Knowledge};
 use serde_json::Value as Json;
-use skills::{Driver, Results, Value, Work};
+use skills::{Driver, DriverError, Results, Value, Work};
 
 /// Looks up the object of its parameter in the graph.
 pub(crate) struct LocateObject {
@@ -15,28 +15,43 @@ pub(crate) struct LocateObject {
 
 #[async_trait]
 impl Driver for LocateObject {
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let id = work.parameters().text("ObjectId").unwrap_or_default();
         let answer = self.knowledge.ask("objects", &[]);
-        let answer = answer.map_err(|fault| fault.to_string())?;
-        located(&answer, id)
+        let answer = answer.map_err(DriverError::device)?;
+        located(&answer, id).map_err(DriverError::device)
     }
 }
 
+/// The reason why the graph does not locate an object.
+#[derive(Debug, PartialEq, thiserror::Error)]
+enum UnlocatedObject {
+    #[error("the graph has no object `{id}`")]
+    Missing { id: String },
+    #[error("the graph has several objects `{id}`")]
+    Several { id: String },
+    #[error("`{column}` of the object `{id}` has other numbers")]
+    Numbers { column: &'static str, id: String },
+}
+
 /// Returns the results for an object, which is identified by its `ua:objectId` or by its IRI.
-fn located(answer: &Answer, id: &str) -> Result<Results, String> {
+fn located(answer: &Answer, id: &str) -> Result<Results, UnlocatedObject> {
+    let owned = || id.to_owned();
     let is_it = |row: &&BTreeMap<String, Json>| {
         [Answer::text(row, "id"), Answer::text(row, "object")].contains(&id)
     };
     let mut rows = answer.rows.iter().filter(is_it);
     let row = rows
         .next()
-        .ok_or_else(|| format!("the graph has no object `{id}`"))?;
+        .ok_or_else(|| UnlocatedObject::Missing { id: owned() })?;
     if rows.next().is_some() {
-        return Err(format!("the graph has several objects `{id}`"));
+        return Err(UnlocatedObject::Several { id: owned() });
     }
-    let wrong = |column: &str| format!("`{column}` of the object `{id}` has other numbers");
-    let numbers = |column: &str, count: usize| match row.get(column) {
+    let wrong = |column| UnlocatedObject::Numbers {
+        column,
+        id: owned(),
+    };
+    let numbers = |column: &'static str, count: usize| match row.get(column) {
         None | Some(Json::Null) => Ok(vec![0.0; count]),
         Some(Json::String(text)) => numbers_of(text, count).ok_or_else(|| wrong(column)),
         Some(Json::Number(number)) if count == 1 => Ok(number.as_f64().into_iter().collect()),
@@ -103,7 +118,7 @@ mod tests {
             ("nut", "the graph has several objects `nut`"),
             ("odd", "`pose` of the object `odd` has other numbers"),
         ] {
-            assert_eq!(find(id).unwrap_err(), why);
+            assert_eq!(find(id).unwrap_err().to_string(), why);
         }
     }
 }

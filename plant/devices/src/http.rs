@@ -47,29 +47,22 @@ pub(crate) struct Asked<'a> {
 }
 
 /// A request without a usable response.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum Fault {
     /// The request was not sent: there is no connection, or Halt came before.
+    #[error("{0}")]
     Unreachable(String),
     /// The request was sent, and the response is missing or damaged.
+    #[error("{0}")]
     Lost(String),
     /// The device has responded with a status that is not a success.
+    #[error("{why}")]
     Refused {
         /// The status code.
         status: u16,
         /// The description with the message of the device.
         why: String,
     },
-}
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Unreachable(why) | Self::Lost(why) | Self::Refused { why, .. } => {
-                f.write_str(why)
-            }
-        }
-    }
 }
 
 impl Host {

@@ -12,7 +12,8 @@ use async_trait::async_trait;
 use serde_json::{Map, Value as Json};
 use skills::yaml::{Code, Kind, Node, Reader};
 use skills::{
-    Builtin, Driver, Measured, Parameters, Results, Sensor, SensorRead, Shape, Value, Work,
+    Builtin, Driver, DriverError, InvalidParameter, Measured, Parameters, Results, Sensor,
+    SensorRead, Shape, Value, Work,
 };
 use tokio::time::{Instant, sleep, sleep_until};
 
@@ -116,8 +117,48 @@ struct HttpSkill {
 /// The end of the work at the device.
 enum Ended {
     Done(Json),
-    Failed(String),
-    Unknown(String),
+    Failed(HttpSkillError),
+    Unknown(HttpSkillError),
+}
+
+/// The reason why the work is not done, or its end is unknown.
+#[derive(Debug, thiserror::Error)]
+enum HttpSkillError {
+    #[error(transparent)]
+    Http(#[from] Fault),
+    /// The device reports a failure with this reason.
+    #[error("{0}")]
+    Reported(String),
+    #[error("the work has not ended within {limit:?} after Halt")]
+    NotHalted { limit: Duration },
+    #[error("the state is unknown: {fault}")]
+    Silent { fault: Fault },
+    #[error("{name}: the response has no {pointer}")]
+    NoResult { name: String, pointer: String },
+    #[error("{name}: {pointer} has a wrong type")]
+    ResultType { name: String, pointer: String },
+    #[error("{why}; {stop}")]
+    Unknown { why: Box<Self>, stop: StopRequest },
+}
+
+impl From<HttpSkillError> for DriverError {
+    fn from(error: HttpSkillError) -> Self {
+        if let HttpSkillError::Reported(why) = error {
+            return Self::reported(why);
+        }
+        Self::device(error)
+    }
+}
+
+/// What became of the `stop` request after an unknown end.
+#[derive(Debug, thiserror::Error)]
+enum StopRequest {
+    #[error("there is no `stop` request")]
+    None,
+    #[error("the `stop` request is done")]
+    Done,
+    #[error("the `stop` request has failed: {0}")]
+    Failed(Fault),
 }
 
 #[async_trait]
@@ -127,7 +168,7 @@ impl Driver for HttpSkill {
         Some(self.halt_timeout + self.within + self.within)
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         let poll = self.poll.as_ref().map(|of| &of.request);
         let all = [Some(&self.start), poll, self.stop.as_ref()];
         for template in all.into_iter().flatten() {
@@ -136,7 +177,7 @@ impl Driver for HttpSkill {
         Ok(())
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         work.step("Start").await;
         let unknown = match self.work(&work).await {
             // The state of the machine is unknown without its results.
@@ -144,17 +185,18 @@ impl Driver for HttpSkill {
                 Ok(results) => return Ok(results),
                 Err(why) => why,
             },
-            Ended::Failed(why) => return Err(why),
+            Ended::Failed(why) => return Err(why.into()),
             Ended::Unknown(why) => why,
         };
-        let stopped = match self.stop(work.parameters()).await {
-            None => "there is no `stop` request".to_owned(),
-            Some(Ok(())) => "the `stop` request is done".to_owned(),
-            Some(Err(fault)) => format!("the `stop` request has failed: {fault}"),
+        let stop = match self.stop(work.parameters()).await {
+            None => StopRequest::None,
+            Some(Ok(())) => StopRequest::Done,
+            Some(Err(fault)) => StopRequest::Failed(fault),
         };
-        let why = format!("{unknown}; {stopped}");
-        work.unknown(&why).await;
-        Err(why)
+        let why = Box::new(unknown);
+        let error = HttpSkillError::Unknown { why, stop };
+        work.unknown(error.to_string()).await;
+        Err(error.into())
     }
 }
 
@@ -172,19 +214,19 @@ impl HttpSkill {
                 // With polling, the stop follows the response: the device could start the work
                 // after a stop that comes too early.
                 if self.poll.is_none() && let Some(Err(fault)) = self.stop(work.parameters()).await {
-                    return Ended::Unknown(fault.to_string());
+                    return Ended::Unknown(fault.into());
                 }
                 starting.await
             }
         };
         let answer = match started {
             Ok(answer) => answer,
-            Err(fault @ Fault::Unreachable(_)) => return Ended::Failed(fault.to_string()),
+            Err(fault @ Fault::Unreachable(_)) => return Ended::Failed(fault.into()),
             // The status of a request that was not accepted.
-            Err(Fault::Refused { status, why }) if (400..500).contains(&status) => {
-                return Ended::Failed(why);
+            Err(fault @ Fault::Refused { status, .. }) if (400..500).contains(&status) => {
+                return Ended::Failed(fault.into());
             }
-            Err(fault) => return Ended::Unknown(fault.to_string()),
+            Err(fault) => return Ended::Unknown(fault.into()),
         };
         match &self.poll {
             None => Ended::Done(answer),
@@ -204,12 +246,12 @@ impl HttpSkill {
                 () = work.stopped(), if until.is_none() => {
                     until = Some(Instant::now() + self.halt_timeout);
                     if let Err(fault) = self.halt(work).await {
-                        return Ended::Unknown(fault.to_string());
+                        return Ended::Unknown(fault.into());
                     }
                 }
                 () = at(until) => {
                     let limit = self.halt_timeout;
-                    return Ended::Unknown(format!("the work has not ended within {limit:?} after Halt"));
+                    return Ended::Unknown(HttpSkillError::NotHalted { limit });
                 }
             }
             let within = self.within.min(LONGEST_SILENCE);
@@ -222,7 +264,7 @@ impl HttpSkill {
             let answer = match asked {
                 Ok(answer) => answer,
                 Err(fault) if answered.elapsed() > LONGEST_SILENCE => {
-                    return Ended::Unknown(format!("the state is unknown: {fault}"));
+                    return Ended::Unknown(HttpSkillError::Silent { fault });
                 }
                 Err(_) => continue,
             };
@@ -231,7 +273,7 @@ impl HttpSkill {
                 return Ended::Done(answer);
             }
             if let Some(why) = poll.failure(&answer) {
-                return Ended::Failed(why);
+                return Ended::Failed(HttpSkillError::Reported(why));
             }
             poll.report(&answer, work, &mut step).await;
         }
@@ -254,12 +296,19 @@ impl HttpSkill {
         Some(stop.send(parameters, self.within).await.map(drop))
     }
 
-    fn outcome(&self, answer: &Json) -> Result<Results, String> {
+    fn outcome(&self, answer: &Json) -> Result<Results, HttpSkillError> {
         let results = self.results.iter().map(|(name, pointer)| {
             let found = answer.pointer(pointer);
-            let found = found.ok_or_else(|| format!("{name}: the response has no {pointer}"))?;
+            let of = || (name.clone(), pointer.clone());
+            let found = found.ok_or_else(|| {
+                let (name, pointer) = of();
+                HttpSkillError::NoResult { name, pointer }
+            })?;
             let value = Value::of_json(found);
-            let value = value.ok_or_else(|| format!("{name}: {pointer} has a wrong type"))?;
+            let value = value.ok_or_else(|| {
+                let (name, pointer) = of();
+                HttpSkillError::ResultType { name, pointer }
+            })?;
             Ok((name.clone(), value))
         });
         results.collect()
@@ -285,7 +334,8 @@ impl Template {
         within: Duration,
         withdrawn: impl Fn() -> bool + Send,
     ) -> Result<Json, Fault> {
-        let (path, body) = self.filled(parameters).map_err(Fault::Unreachable)?;
+        let filled = self.filled(parameters);
+        let (path, body) = filled.map_err(|why| Fault::Unreachable(why.to_string()))?;
         let asked = Asked {
             method: &self.method,
             path: &path,
@@ -298,11 +348,11 @@ impl Template {
     /// Returns the path and the body with the values of parameters.
     ///
     /// # Errors
-    /// The name of a parameter that is unknown or does not fit in the path.
-    fn filled(&self, parameters: &Parameters) -> Result<(String, Option<Json>), String> {
+    /// A parameter that is unknown or does not fit in the path.
+    fn filled(&self, parameters: &Parameters) -> Result<(String, Option<Json>), InvalidParameter> {
         let value = |name: &str| {
             let value = parameters.get(name).map(Value::to_json);
-            value.ok_or_else(|| format!("{name} is not a parameter of the skill"))
+            value.ok_or_else(|| no_parameter(name))
         };
         let path = filled_path(&self.path, &value)?;
         let body = self.body.as_ref().map(|body| filled(body, &value));
@@ -310,8 +360,19 @@ impl Template {
     }
 }
 
+fn no_parameter(name: &str) -> InvalidParameter {
+    InvalidParameter::Unexpected {
+        name: name.to_owned(),
+        given: None,
+        expected: "is not a parameter of the skill".to_owned(),
+    }
+}
+
 /// Replaces each `{Name}` of a text.
-fn fill(text: &str, value: &dyn Fn(&str) -> Result<String, String>) -> Result<String, String> {
+fn fill(
+    text: &str,
+    value: &dyn Fn(&str) -> Result<String, InvalidParameter>,
+) -> Result<String, InvalidParameter> {
     let mut out = String::new();
     let mut rest = text;
     while let Some((before, after)) = rest.split_once('{') {
@@ -334,12 +395,12 @@ fn fill(text: &str, value: &dyn Fn(&str) -> Result<String, String>) -> Result<St
 /// Fills a path and its query. Values are escaped: each stays within its segment of the path.
 ///
 /// # Errors
-/// The name of a parameter that is unknown, or with which a segment is `.` or `..`: servers replace
-/// such segments.
+/// A parameter that is unknown, or with which a segment is `.` or `..`: servers replace such
+/// segments.
 fn filled_path(
     template: &str,
-    value: &dyn Fn(&str) -> Result<Json, String>,
-) -> Result<String, String> {
+    value: &dyn Fn(&str) -> Result<Json, InvalidParameter>,
+) -> Result<String, InvalidParameter> {
     let (path, query) = match template.find('?') {
         Some(at) => template.split_at(at),
         None => (template, ""),
@@ -350,14 +411,21 @@ fn filled_path(
         let name = template.split(['{', '}']).nth(1);
         match name.filter(|_| matches!(&*segment, "." | "..")) {
             None => Ok(segment),
-            Some(name) => Err(format!("{name}: a segment of the path is `{segment}`")),
+            Some(name) => Err(InvalidParameter::Unexpected {
+                name: name.to_owned(),
+                given: Some(segment.as_str().into()),
+                expected: format!("makes `{segment}` a segment of the path"),
+            }),
         }
     };
     let segments: Vec<String> = path.split('/').map(segment).collect::<Result<_, _>>()?;
     Ok(segments.join("/") + &part(query)?)
 }
 
-fn filled(json: &Json, value: &dyn Fn(&str) -> Result<Json, String>) -> Result<Json, String> {
+fn filled(
+    json: &Json,
+    value: &dyn Fn(&str) -> Result<Json, InvalidParameter>,
+) -> Result<Json, InvalidParameter> {
     Ok(match json {
         Json::String(text) => {
             let whole = text.strip_prefix('{').and_then(|of| of.strip_suffix('}'));
@@ -374,7 +442,7 @@ fn filled(json: &Json, value: &dyn Fn(&str) -> Result<Json, String>) -> Result<J
             let entries = entries
                 .iter()
                 .map(|(key, json)| Ok((key.clone(), filled(json, value)?)));
-            Json::Object(entries.collect::<Result<Map<_, _>, String>>()?)
+            Json::Object(entries.collect::<Result<Map<_, _>, InvalidParameter>>()?)
         }
         Json::Null | Json::Bool(_) | Json::Number(_) => json.clone(),
     })

@@ -5,6 +5,7 @@
 //! is therefore a component that runs the skills of a robot, and reads an analog input between two
 //! of them.
 
+mod error;
 pub mod simulator;
 mod volts;
 
@@ -15,16 +16,17 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    Builtin, COMPOSITE_HALT_TIMEOUT, Chosen, Device, DeviceValue, Driver, DriverFault, Measured,
-    Needs, Parameters, PartEnd, Partner, PeerAccess, Results, Runs, SkillClient, SkillFault,
-    ToolState, TypeName, Value, Work, run_part,
+    Builtin, COMPOSITE_HALT_TIMEOUT, Chosen, Device, DeviceValue, Driver, DriverError, DriverFault,
+    InvalidParameter, Measured, Needs, Parameters, PartEnd, Partner, PartnerError, PeerAccess,
+    Results, Runs, SkillClient, SkillFault, ToolState, TypeName, Value, Work, run_part,
 };
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 
-pub use self::volts::{Detector, LEVELS, Reading, volts};
+use self::error::KelvinError;
+pub use self::volts::{Detector, InvalidVoltage, LEVELS, Reading, volts};
 use crate::line::Line;
-use crate::modbus::Modbus;
+use crate::modbus::{Fault, Modbus};
 use crate::sensors::{ticks, value};
 
 /// The installation of the changer.
@@ -128,17 +130,17 @@ impl Changer {
         }
     }
 
-    /// Shows a reading to clients.
-    fn show(&self, reading: Result<Reading, String>) {
+    /// Shows a reading to clients; `None` if there is none.
+    fn show(&self, reading: Option<Reading>) {
         let current = match reading {
-            Ok(Reading::Ready | Reading::NoTool) => Some(String::new()),
-            Ok(Reading::Tool(number)) => {
+            Some(Reading::Ready | Reading::NoTool) => Some(String::new()),
+            Some(Reading::Tool(number)) => {
                 let mut tools = self.settings.tools.iter();
                 let known = tools.find(|tool| tool.number == number);
                 known.map(|tool| tool.uri.clone())
             }
             // The ring is between open and locked, or the converter does not answer.
-            Ok(Reading::Intermediate) | Err(_) => None,
+            Some(Reading::Intermediate) | None => None,
         };
         self.change(|state| state.current = current);
     }
@@ -226,14 +228,14 @@ impl Device for Changer {
             ticks.tick().await;
             let volts = match look.volts().await {
                 Ok(volts) => volts,
-                Err(why) => return why,
+                Err(why) => return why.to_string(),
             };
             out.put("Voltage", Ok(volts.into()));
             let number = match look.detector.feed(volts) {
                 Ok(Reading::Ready | Reading::NoTool) => Ok(Value::Byte(0)),
                 Ok(Reading::Tool(number)) => Ok(Value::Byte(number)),
                 Ok(between @ Reading::Intermediate) => Err(between.to_string()),
-                Err(why) => Err(why),
+                Err(why) => Err(why.to_string()),
             };
             out.put("ToolNumber", number);
         }
@@ -247,7 +249,7 @@ impl Device for Changer {
             };
             loop {
                 let reading = look.steady().await;
-                self.show(reading);
+                self.show(reading.ok());
                 sleep(SHOWN_EVERY).await;
             }
         };
@@ -335,7 +337,7 @@ impl Driver for Change {
         Some(COMPOSITE_HALT_TIMEOUT)
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         match self.what {
             What::Detach => Ok(()),
             What::Attach | What::Change => self.wanted(parameters).map(drop),
@@ -351,13 +353,13 @@ impl Driver for Change {
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let mut look = Look {
             changer: &self.changer,
             detector: Detector::default(),
         };
         let now = look.steady().await?;
-        self.changer.show(Ok(now));
+        self.changer.show(Some(now));
         let wanted = match self.what {
             What::Detach => None,
             What::Attach | What::Change => {
@@ -367,9 +369,7 @@ impl Driver for Change {
         let wanted = wanted.as_ref();
         let attached = match now {
             Reading::Intermediate => {
-                return Err(format!(
-                    "nothing is moved: {now}, and somebody has to look at it"
-                ));
+                return Err(KelvinError::Between { now }.into());
             }
             Reading::Ready | Reading::NoTool => None,
             Reading::Tool(number) => Some(number),
@@ -382,9 +382,7 @@ impl Driver for Change {
         }
         let put = match (attached, self.what) {
             (Some(number), What::Attach) => {
-                return Err(format!(
-                    "nothing is moved: tool {number} has to be detached first"
-                ));
+                return Err(KelvinError::Occupied { number }.into());
             }
             (Some(number), What::Change) => Some(self.at(self.tool(number)?, None)),
             (Some(number), What::Detach) => {
@@ -405,19 +403,22 @@ impl Driver for Change {
             }
             Err(why) => {
                 let now = look.steady().await;
-                self.changer.show(now.clone());
-                let now = now.map_or_else(|why| why, |now| now.to_string());
-                Err(format!("{why}; {now}"))
+                self.changer.show(now.as_ref().ok().copied());
+                let error = KelvinError::After {
+                    why: Box::new(why),
+                    now: now.map_err(Box::new),
+                };
+                Err(error.into())
             }
         }
     }
 }
 
 impl Change {
-    fn wanted(&self, parameters: &Parameters) -> Result<&Tool, String> {
+    fn wanted(&self, parameters: &Parameters) -> Result<&Tool, InvalidParameter> {
         let uri = parameters
             .text("ToolAppUri")
-            .ok_or("ToolAppUri is no text")?;
+            .ok_or_else(|| InvalidParameter::missing("ToolAppUri", "text"))?;
         let mut tools = self.changer.settings.tools.iter();
         tools.find(|tool| tool.uri == uri).ok_or_else(|| {
             let known: Vec<&str> = self
@@ -427,7 +428,11 @@ impl Change {
                 .iter()
                 .map(|tool| tool.uri.as_str())
                 .collect();
-            format!("ToolAppUri is one of {}", known.join(", "))
+            InvalidParameter::Unexpected {
+                name: "ToolAppUri".to_owned(),
+                given: Some(uri.into()),
+                expected: format!("is one of {}", known.join(", ")),
+            }
         })
     }
 
@@ -442,7 +447,7 @@ impl Change {
     }
 
     /// Switches the component of a tool off before the tool loses its supply.
-    async fn power_off(&self, tool: &Tool, work: &Work) -> Result<(), String> {
+    async fn power_off(&self, tool: &Tool, work: &Work) -> Result<(), KelvinError> {
         let Some(detector) = &self.changer.peers.detector else {
             return Ok(());
         };
@@ -453,13 +458,13 @@ impl Change {
             return Ok(());
         };
         work.step("PowerOff").await;
-        let refused = |why: String| format!("{} is not switched off: {why}", tool.uri);
+        let refused = |why: &dyn fmt::Display| format!("{} is not switched off: {why}", tool.uri);
         let client = self.changer.peers.connect(&found.endpoint).await;
         let client = match client {
             Ok(client) => client,
             Err(why) => {
                 // The component has lost its supply already, or has never started.
-                work.note(refused(why)).await;
+                work.note(refused(&why)).await;
                 return Ok(());
             }
         };
@@ -472,15 +477,18 @@ impl Change {
                 format!("{} {gone}", tool.uri)
             }
             Ok(false) => format!("{} has no PowerOffDevice", tool.uri),
-            Err(fault) => refused(fault.to_string()),
+            Err(fault) => refused(fault),
         };
         client.close().await;
         work.note(note).await;
-        off.map(drop).map_err(|fault| refused(fault.to_string()))
+        off.map(drop).map_err(|fault| KelvinError::NotOff {
+            uri: tool.uri.clone(),
+            fault,
+        })
     }
 
     /// Waits until the component of a locked tool is found and its skills have a state.
-    async fn await_ready(&self, tool: &Tool, work: &Work) -> Result<(), String> {
+    async fn await_ready(&self, tool: &Tool, work: &Work) -> Result<(), KelvinError> {
         let Some(detector) = &self.changer.peers.detector else {
             return Ok(());
         };
@@ -497,7 +505,7 @@ impl Change {
                 match found {
                     Ok(found) => match self.is_ready(&found.endpoint).await {
                         Ok(()) => return,
-                        Err(reason) => why = reason,
+                        Err(reason) => why = reason.to_string(),
                     },
                     Err(_) => why = format!("it is not found{}", detector.unreadable()),
                 }
@@ -506,13 +514,14 @@ impl Change {
         };
         let waited = tokio::select! {
             waited = timeout(limit, ready) => waited.is_ok(),
-            () = work.stopped() => return Err("stopped".to_owned()),
+            () = work.stopped() => return Err(KelvinError::Stopped),
         };
         if !waited {
-            return Err(format!(
-                "the tool is locked, and its component {} is not ready within {limit:?}: {why}",
-                tool.uri
-            ));
+            return Err(KelvinError::NotReady {
+                uri: tool.uri.clone(),
+                within: limit,
+                why,
+            });
         }
         let took = began.elapsed().as_millis();
         work.note(format!(
@@ -523,7 +532,7 @@ impl Change {
         Ok(())
     }
 
-    async fn is_ready(&self, endpoint: &str) -> Result<(), String> {
+    async fn is_ready(&self, endpoint: &str) -> Result<(), PartnerError> {
         let client = self.changer.peers.connect(endpoint).await?;
         let ready = async {
             for skill in client.skills().await? {
@@ -533,14 +542,17 @@ impl Change {
         };
         let ready: Result<(), SkillFault> = ready.await;
         client.close().await;
-        ready.map_err(|fault| format!("{endpoint}: {fault}"))
+        ready.map_err(|fault| PartnerError::Component {
+            endpoint: endpoint.to_owned(),
+            fault,
+        })
     }
 
-    fn tool(&self, number: u8) -> Result<&Tool, String> {
+    fn tool(&self, number: u8) -> Result<&Tool, KelvinError> {
         let mut tools = self.changer.settings.tools.iter();
         tools
             .find(|tool| tool.number == number)
-            .ok_or_else(|| format!("nothing is moved: tool {number} is attached, and has no dock"))
+            .ok_or(KelvinError::NoDock { number })
     }
 
     async fn moved(
@@ -549,7 +561,7 @@ impl Change {
         look: &mut Look<'_>,
         (put, take): (Option<&Tool>, Option<&Tool>),
         work: &Work,
-    ) -> Result<(), String> {
+    ) -> Result<(), KelvinError> {
         let within = self.changer.settings.within;
         if let Some(tool) = put {
             self.power_off(tool, work).await?;
@@ -557,14 +569,14 @@ impl Change {
             work.step("WaitForRelease").await;
             look.until(Reading::NoTool, work).await?;
             self.changer.remember(tool);
-            self.changer.show(Ok(Reading::NoTool));
+            self.changer.show(Some(Reading::NoTool));
         }
         if let Some(tool) = take {
             mover.go(&tool.take(), within, work).await?;
             work.step("WaitForTool").await;
             look.until(Reading::Tool(tool.number), work).await?;
             self.changer.remember(tool);
-            self.changer.show(Ok(Reading::Tool(tool.number)));
+            self.changer.show(Some(Reading::Tool(tool.number)));
             let approach = ("Approach", true, tool.beside((FRONT, APPROACH), LOCKED));
             mover.go(&[approach], within, work).await?;
         }
@@ -584,13 +596,13 @@ struct Look<'c> {
 }
 
 impl Look<'_> {
-    async fn once(&mut self) -> Result<Reading, String> {
+    async fn once(&mut self) -> Result<Reading, KelvinError> {
         let volts = self.volts().await?;
-        self.detector.feed(volts)
+        Ok(self.detector.feed(volts)?)
     }
 
     /// Returns the voltage at the changer.
-    async fn volts(&self) -> Result<f64, String> {
+    async fn volts(&self) -> Result<f64, Fault> {
         let Converter {
             register,
             divider: (line, ground),
@@ -602,7 +614,7 @@ impl Look<'_> {
     }
 
     /// Returns the reading of two equal consecutive measurements.
-    async fn steady(&mut self) -> Result<Reading, String> {
+    async fn steady(&mut self) -> Result<Reading, KelvinError> {
         let mut last = self.once().await?;
         for _ in 0..MOST_LOOKS {
             sleep(POLL).await;
@@ -612,10 +624,10 @@ impl Look<'_> {
             }
             last = now;
         }
-        Err("the voltage of the tool changer does not come to rest".to_owned())
+        Err(KelvinError::Unsteady)
     }
 
-    async fn until(&mut self, wanted: Reading, work: &Work) -> Result<(), String> {
+    async fn until(&mut self, wanted: Reading, work: &Work) -> Result<(), KelvinError> {
         let until = Instant::now() + SWITCHED;
         loop {
             let now = self.once().await?;
@@ -623,12 +635,10 @@ impl Look<'_> {
                 return Ok(());
             }
             if Instant::now() >= until {
-                return Err(format!(
-                    "the tool changer has not switched within {SWITCHED:?}"
-                ));
+                return Err(KelvinError::NotSwitched);
             }
             tokio::select! {
-                () = work.stopped() => return Err("stopped".to_owned()),
+                () = work.stopped() => return Err(KelvinError::Stopped),
                 () = sleep(POLL) => {}
             }
         }
@@ -644,7 +654,7 @@ struct Connected {
 
 impl Changer {
     /// Connects to the robot.
-    async fn connected(&self, work: &Work) -> Result<Connected, String> {
+    async fn connected(&self, work: &Work) -> Result<Connected, KelvinError> {
         let partner = match &self.mover {
             Mover::Skills { ptp, linear } => {
                 return Ok(Connected {
@@ -658,7 +668,7 @@ impl Changer {
         let needs = Needs::default();
         let endpoint = tokio::select! {
             found = self.peers.robot(partner.as_ref(), &needs) => found?.endpoint,
-            () = work.stopped() => return Err("stopped".to_owned()),
+            () = work.stopped() => return Err(KelvinError::Stopped),
         };
         self.change(|state| state.mover.clone_from(&endpoint));
         let client = self.peers.connect(&endpoint).await?;
@@ -670,7 +680,7 @@ impl Changer {
             }),
             Err(fault) => {
                 client.close().await;
-                Err(format!("{endpoint}: {fault}"))
+                Err(PartnerError::Component { endpoint, fault }.into())
             }
         }
     }
@@ -693,7 +703,7 @@ impl Connected {
         Ok((ptp, linear))
     }
 
-    async fn go(&self, ways: &[Way], within: Duration, work: &Work) -> Result<(), String> {
+    async fn go(&self, ways: &[Way], within: Duration, work: &Work) -> Result<(), KelvinError> {
         for (step, straight, to) in ways {
             work.step(*step).await;
             let skill = if *straight { &self.linear } else { &self.ptp };
@@ -701,19 +711,20 @@ impl Connected {
             let outcome = match run_part(&**skill, parameters, within, work, work.stopped()).await {
                 PartEnd::Ended(outcome) => outcome,
                 PartEnd::Interrupted { halted, .. } => {
-                    let halted = halted.err();
-                    let why =
-                        halted.map(|fault| format!(", and the robot cannot be halted: {fault}"));
-                    return Err(format!("stopped at {step}{}", why.unwrap_or_default()));
+                    return Err(KelvinError::StoppedAt { step, halted });
                 }
             };
-            let outcome = outcome.map_err(|fault| format!("{step}: {}: {fault}", skill.name()))?;
+            let outcome = outcome.map_err(|fault| KelvinError::Skill {
+                step,
+                skill: skill.name(),
+                fault,
+            })?;
             if !outcome.succeeded {
-                return Err(format!(
-                    "{step}: {} failed: {}",
-                    skill.name(),
-                    outcome.message
-                ));
+                return Err(KelvinError::Failed {
+                    step,
+                    skill: skill.name(),
+                    message: outcome.message,
+                });
             }
         }
         Ok(())

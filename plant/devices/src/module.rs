@@ -4,6 +4,7 @@
 //! Reading order: this module (the device), `handshake` (the waits and writes), `procedure` (a
 //! run), `nodes` (the OPC UA client), `types` (the NodeSet with the skill types).
 
+mod error;
 mod handshake;
 mod nodes;
 mod procedure;
@@ -24,6 +25,7 @@ use skills::{
 };
 use tokio::sync::Mutex;
 
+pub use error::NodeError;
 pub use handshake::{ModuleNodes, Timing};
 use nodes::UaNodes;
 use procedure::Run;

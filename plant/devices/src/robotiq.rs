@@ -10,13 +10,13 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    Builtin, Device, DeviceValue, Driver, DriverFault, Measured, Parameters, PeerAccess, Results,
-    TypeName, Value, Work,
+    Builtin, Device, DeviceValue, Driver, DriverError, DriverFault, InvalidParameter, Measured,
+    Parameters, PeerAccess, Results, TypeName, Value, Work,
 };
 use tokio::time::{Instant, sleep};
 
 use crate::line::Line;
-use crate::modbus::Modbus;
+use crate::modbus::{Fault, Modbus};
 use crate::sensors::{ticks, value};
 
 /// Address of the command registers: action, reserved; reserved, position; speed, force.
@@ -82,7 +82,7 @@ impl Device for Gripper {
                 Err(fault) => return fault.to_string(),
             };
             let Some(status) = status else {
-                return "the gripper answers without its status".to_owned();
+                return RobotiqError::NoStatus.to_string();
             };
             out.put(
                 "Active",
@@ -182,6 +182,39 @@ impl Status {
     }
 }
 
+/// The reason why a motion of the fingers is not done.
+#[derive(Debug, thiserror::Error)]
+enum RobotiqError {
+    #[error(transparent)]
+    Modbus(#[from] Fault),
+    #[error("the gripper answers without its status")]
+    NoStatus,
+    #[error("nothing is between the fingers")]
+    NothingGrasped,
+    #[error("something stops the fingers at position {position} while they open")]
+    Blocked { position: u8 },
+    #[error("the gripper cannot be activated: {why}")]
+    NotActivated { why: &'static str },
+    #[error("the gripper is not activated within {:?}", ACTIVATION)]
+    SlowActivation,
+    #[error("the gripper has lost its activation while it moved: was it switched off?")]
+    LostActivation,
+    #[error("the gripper stopped: {why}")]
+    Broken { why: &'static str },
+    #[error("the fingers do not come to a stand within {:?}", MOTION)]
+    NotAtRest,
+    #[error("stopped while it was being activated")]
+    StoppedInActivation,
+    #[error("stopped with the fingers at position {position} of 255")]
+    Stopped { position: u8 },
+}
+
+impl From<RobotiqError> for DriverError {
+    fn from(error: RobotiqError) -> Self {
+        Self::device(error)
+    }
+}
+
 /// A motion that opens or closes the gripper.
 #[derive(Debug)]
 struct Motion {
@@ -212,16 +245,20 @@ impl Driver for Motion {
         true
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         match parameters.number("Width") {
-            Some(width) if self.what == What::Width && width > STROKE => Err(format!(
-                "Width is {width} m, and the fingers open {STROKE} m"
-            )),
+            Some(width) if self.what == What::Width && width > STROKE => {
+                Err(InvalidParameter::OutOfRange {
+                    name: "Width".to_owned(),
+                    given: format!("{width} m"),
+                    limit: format!("the fingers open {STROKE} m"),
+                })
+            }
             _ => Ok(()),
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         self.activate(&work).await?;
         let (step, position) = match self.what {
             What::Close => ("Close", 255),
@@ -237,11 +274,11 @@ impl Driver for Motion {
         let ended = self.go(goal, &work).await?;
         match (self.what, ended.object) {
             (What::Close, 2) => Ok(vec![("Gripped".to_owned(), true.into())]),
-            (What::Close, _) => Err("nothing is between the fingers".to_owned()),
-            (What::Open, 1) => Err(format!(
-                "something stops the fingers at position {} while they open",
-                ended.position
-            )),
+            (What::Close, _) => Err(RobotiqError::NothingGrasped.into()),
+            (What::Open, 1) => {
+                let position = ended.position;
+                Err(RobotiqError::Blocked { position }.into())
+            }
             (What::Open, _) => Ok(Vec::new()),
             (What::Width, object) => Ok(vec![
                 ("Width".to_owned(), width(ended.position).into()),
@@ -252,23 +289,23 @@ impl Driver for Motion {
 }
 
 impl Motion {
-    async fn status(&self) -> Result<Status, String> {
+    async fn status(&self) -> Result<Status, RobotiqError> {
         let words = self.modbus.holding(STATUS, 3).await?;
-        Status::of(&words).ok_or_else(|| "the gripper answers without its status".to_owned())
+        Status::of(&words).ok_or(RobotiqError::NoStatus)
     }
 
-    async fn act(&self, action: u8, goal: Goal) -> Result<(), String> {
+    async fn act(&self, action: u8, goal: Goal) -> Result<(), Fault> {
         let words = [
             u16::from_be_bytes([action, 0]),
             u16::from_be_bytes([0, goal.position]),
             u16::from_be_bytes([goal.speed, goal.force]),
         ];
-        Ok(self.modbus.write(ACTION, &words).await?)
+        self.modbus.write(ACTION, &words).await
     }
 
     /// Activates the gripper if it is not active: after power-on, or after a fault that only a new
     /// activation clears.
-    async fn activate(&self, work: &Work) -> Result<(), String> {
+    async fn activate(&self, work: &Work) -> Result<(), RobotiqError> {
         let still = Goal {
             position: 0,
             speed: 0,
@@ -284,7 +321,7 @@ impl Motion {
         let until = Instant::now() + ACTIVATION;
         loop {
             tokio::select! {
-                () = work.stopped() => return Err("stopped while it was being activated".to_owned()),
+                () = work.stopped() => return Err(RobotiqError::StoppedInActivation),
                 () = sleep(POLL) => {}
             }
             let status = self.status().await?;
@@ -292,18 +329,16 @@ impl Motion {
                 return Ok(());
             }
             if let (0x0A.., Some(why)) = (status.fault, status.broken()) {
-                return Err(format!("the gripper cannot be activated: {why}"));
+                return Err(RobotiqError::NotActivated { why });
             }
             if Instant::now() >= until {
-                return Err(format!(
-                    "the gripper is not activated within {ACTIVATION:?}"
-                ));
+                return Err(RobotiqError::SlowActivation);
             }
         }
     }
 
     /// Moves the fingers until they stop.
-    async fn go(&self, goal: Goal, work: &Work) -> Result<Status, String> {
+    async fn go(&self, goal: Goal, work: &Work) -> Result<Status, RobotiqError> {
         let from = self.status().await?.position;
         self.act(GO, goal).await?;
         let mut until = Instant::now() + MOTION;
@@ -312,8 +347,8 @@ impl Motion {
                 () = work.held() => {
                     self.act(ACTIVATE, goal).await?;
                     if work.going().await.is_err() {
-                        let at = self.status().await?.position;
-                        return Err(format!("stopped with the fingers at position {at} of 255"));
+                        let position = self.status().await?.position;
+                        return Err(RobotiqError::Stopped { position });
                     }
                     self.act(GO, goal).await?;
                     until = Instant::now() + MOTION;
@@ -322,22 +357,17 @@ impl Motion {
             }
             let status = self.status().await?;
             if !status.active || status.activation != 3 {
-                return Err(
-                    "the gripper has lost its activation while it moved: was it switched off?"
-                        .to_owned(),
-                );
+                return Err(RobotiqError::LostActivation);
             }
             if let Some(why) = status.broken() {
-                return Err(format!("the gripper stopped: {why}"));
+                return Err(RobotiqError::Broken { why });
             }
             if status.wanted == goal.position && status.object != 0 {
                 return Ok(status);
             }
             work.progress(share(from, status.position, goal.position));
             if Instant::now() >= until {
-                return Err(format!(
-                    "the fingers do not come to a stand within {MOTION:?}"
-                ));
+                return Err(RobotiqError::NotAtRest);
             }
         }
     }

@@ -14,12 +14,12 @@ use std::time::Duration;
 use async_trait::async_trait;
 use serde_json::{Value, json};
 use skills::{
-    Builtin, Device, DeviceValue, Driver, DriverFault, Measured, PeerAccess, Results, TypeName,
-    Work,
+    Builtin, Device, DeviceValue, Driver, DriverError, DriverFault, Measured, PeerAccess, Results,
+    TypeName, Work,
 };
 use tokio::time::{Instant, sleep};
 
-use crate::http::{Asked, Host};
+use crate::http::{Asked, Fault, Host};
 use crate::sensors::{ticks, value};
 
 /// A gripper.
@@ -95,7 +95,7 @@ impl Device for Gripper {
             ticks.tick().await;
             let status = match self.port.status().await {
                 Ok(status) => status,
-                Err(why) => return why,
+                Err(why) => return why.to_string(),
             };
             out.put("PartPresent", Ok(status.part_present.into()));
             out.put("InControlRange", Ok(status.in_control_range.into()));
@@ -134,6 +134,39 @@ const VALUES: [DeviceValue; 5] = [
         "0 works, 1 works with warnings, 2 with severe warnings, 3 does not work.",
     ),
 ];
+
+/// The reason why a gripper has no state, or has not done its work.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum SchmalzError {
+    #[error(transparent)]
+    Http(#[from] Fault),
+    #[error("the answer of {master} is damaged: {why}")]
+    Damaged { master: String, why: &'static str },
+    #[error("{master} says that the data of {alias} are not valid")]
+    NotValid { master: String, alias: String },
+    #[error("stopped, and the vacuum is switched off")]
+    Stopped,
+    #[error("the gripper says that it does not work properly")]
+    Broken,
+    #[error(
+        "no part is held after {within:?}: the vacuum is {vacuum} mbar, {}in the range of control",
+        if *in_control_range { "" } else { "not " }
+    )]
+    NotHeld {
+        within: Duration,
+        /// mbar
+        vacuum: u16,
+        in_control_range: bool,
+    },
+    #[error("the part is still there after {within:?}")]
+    NotReleased { within: Duration },
+}
+
+impl From<SchmalzError> for DriverError {
+    fn from(error: SchmalzError) -> Self {
+        Self::device(error)
+    }
+}
 
 /// A port of a master.
 #[derive(Debug)]
@@ -184,14 +217,14 @@ impl Port {
         }
     }
 
-    async fn status(&self) -> Result<Status, String> {
+    async fn status(&self) -> Result<Status, SchmalzError> {
         let bytes = self.process_data().await?;
         let status = Status::of(&bytes);
         status.ok_or_else(|| self.damaged("the process data are not four bytes"))
     }
 
     /// Returns the process data of the device at the port.
-    pub(crate) async fn process_data(&self) -> Result<Vec<u8>, String> {
+    pub(crate) async fn process_data(&self) -> Result<Vec<u8>, SchmalzError> {
         let path = format!(
             "{}/{}/processdata/getdata/value?format=byteArray",
             DEVICES, self.alias
@@ -201,10 +234,10 @@ impl Port {
         let data = answer.get("ioLink").or_else(|| answer.get("iolink"));
         let data = data.ok_or_else(|| self.damaged("it has no process data"))?;
         if data.get("valid").and_then(Value::as_bool) == Some(false) {
-            return Err(format!(
-                "{} says that the data of {} are not valid",
-                self.master, self.alias
-            ));
+            return Err(SchmalzError::NotValid {
+                master: self.master.to_string(),
+                alias: self.alias.clone(),
+            });
         }
         let bytes: Option<Vec<u8>> =
             data.get("value")
@@ -218,25 +251,27 @@ impl Port {
         bytes.ok_or_else(|| self.damaged("the process data are not bytes"))
     }
 
-    async fn set(&self, out: u8) -> Result<(), String> {
+    async fn set(&self, out: u8) -> Result<(), Fault> {
         let path = format!("{}/{}/processdata/value", DEVICES, self.alias);
         let data = json!({"ioLink": {"valid": true, "value": [out, 0]}});
         self.ask("POST", &path, Some(&data)).await.map(drop)
     }
 
-    async fn ask(&self, method: &str, path: &str, body: Option<&Value>) -> Result<Value, String> {
+    async fn ask(&self, method: &str, path: &str, body: Option<&Value>) -> Result<Value, Fault> {
         let asked = Asked {
             method,
             path,
             body,
             within: ANSWER,
         };
-        let answer = self.master.ask(asked).await;
-        answer.map_err(|fault| fault.to_string())
+        self.master.ask(asked).await
     }
 
-    fn damaged(&self, why: &str) -> String {
-        format!("the answer of {} is damaged: {why}", self.master)
+    fn damaged(&self, why: &'static str) -> SchmalzError {
+        SchmalzError::Damaged {
+            master: self.master.to_string(),
+            why,
+        }
     }
 }
 
@@ -250,28 +285,30 @@ struct Motion {
 
 #[async_trait]
 impl Driver for Motion {
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let (step, out) = if self.holds {
             ("Suck", VACUUM)
         } else {
             ("BlowOff", BLOW_OFF)
         };
         work.step(step).await;
-        self.port.set(out).await?;
+        self.port.set(out).await.map_err(SchmalzError::from)?;
         let waited = self.wait(&work).await;
         match (self.holds, waited) {
             (true, Ok(())) => Ok(vec![("Gripped".to_owned(), true.into())]),
             (_, waited) => {
                 // The vacuum is switched off if no part is held, and so is the air after blowing.
                 let off = self.port.set(0).await;
-                waited.and(off).map(|()| Vec::new())
+                waited?;
+                off.map_err(SchmalzError::from)?;
+                Ok(Vec::new())
             }
         }
     }
 }
 
 impl Motion {
-    async fn wait(&self, work: &Work) -> Result<(), String> {
+    async fn wait(&self, work: &Work) -> Result<(), SchmalzError> {
         let within = if self.holds {
             self.timing.grasp
         } else {
@@ -280,12 +317,12 @@ impl Motion {
         let began = Instant::now();
         loop {
             tokio::select! {
-                () = work.stopped() => return Err("stopped, and the vacuum is switched off".to_owned()),
+                () = work.stopped() => return Err(SchmalzError::Stopped),
                 () = sleep(POLL) => {}
             }
             let status = self.port.status().await?;
             if status.health == 3 {
-                return Err("the gripper says that it does not work properly".to_owned());
+                return Err(SchmalzError::Broken);
             }
             let done = match self.holds {
                 true => status.part_present,
@@ -296,13 +333,13 @@ impl Motion {
             }
             work.progress(began.elapsed().as_secs_f32() / within.as_secs_f32());
             if began.elapsed() >= within {
-                let range = if status.in_control_range { "" } else { "not " };
                 return Err(match self.holds {
-                    true => format!(
-                        "no part is held after {within:?}: the vacuum is {} mbar, {range}in the range of control",
-                        status.vacuum
-                    ),
-                    false => format!("the part is still there after {within:?}"),
+                    true => SchmalzError::NotHeld {
+                        within,
+                        vacuum: status.vacuum,
+                        in_control_range: status.in_control_range,
+                    },
+                    false => SchmalzError::NotReleased { within },
                 });
             }
         }

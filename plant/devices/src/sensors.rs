@@ -92,7 +92,7 @@ impl Sensor for ProcessData {
             ticks.tick().await;
             let bytes = match self.port.process_data().await {
                 Ok(bytes) => bytes,
-                Err(why) => return why,
+                Err(why) => return why.to_string(),
             };
             out.put_single(self.number.of(bytes.get(self.byte..).unwrap_or_default()));
         }

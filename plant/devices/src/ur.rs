@@ -5,6 +5,7 @@
 //! program of another client is never mistaken for it. Suspending sets the speed slider to zero,
 //! halting brakes along the path.
 
+mod error;
 mod follower;
 mod force;
 mod pose;
@@ -19,18 +20,20 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use skills::{
-    Builtin, Device, DeviceValue, Driver, DriverFault, Measured, Parameters, PeerAccess, Results,
-    Shape, TypeName, Work,
+    Builtin, Device, DeviceValue, Driver, DriverError, DriverFault, InvalidParameter, Measured,
+    Parameters, PeerAccess, Results, Shape, TypeName, Work,
 };
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
 use tokio::time::{Instant, sleep, timeout, timeout_at};
 
+use self::error::{StopProgram, StoppedRobot, UrError};
 pub use self::follower::Follower;
 use self::force::Guard;
 pub use self::pose::{of_robot, to_robot};
 use self::rtde::Rtde;
-use self::state::{INPUTS, OUTPUTS, PAUSED, STOPPED, State};
+pub use self::rtde::RtdeError;
+use self::state::{INPUTS, OUTPUTS, PAUSED, STOPPED, State, UnfitRobot};
 use self::wire::Value;
 use crate::modbus::connected;
 use crate::sensors::value;
@@ -115,12 +118,12 @@ impl Device for Robot {
         let opened = Rtde::open(&self.settings.rtde, hertz, &recipe, &[]).await;
         let mut rtde = match opened {
             Ok(rtde) => rtde,
-            Err(why) => return why,
+            Err(why) => return why.to_string(),
         };
         loop {
             let values = match rtde.next().await {
                 Ok(values) => values,
-                Err(why) => return why,
+                Err(why) => return why.to_string(),
             };
             for ((name, _), value) in MEASURED.iter().zip(values) {
                 out.put(name, shown(name, value));
@@ -225,35 +228,40 @@ impl Driver for Motion {
         true
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         if self.kind == Kind::Joints {
             return joint_target(parameters).map(drop);
         }
-        let target = parameters.six("TargetPosition");
-        let [x, y, z, ..] = target.ok_or("TargetPosition has no six numbers")?;
+        let [x, y, z, ..] = pose_target(parameters)?;
         let (far, reach) = ((x * x + y * y + z * z).sqrt(), self.settings.reach);
         if far > reach {
-            return Err(format!(
-                "TargetPosition is {far:.3} m from the base, and the robot reaches {reach} m"
-            ));
+            return Err(InvalidParameter::OutOfRange {
+                name: TARGET.to_owned(),
+                given: format!("{far:.3} m from the base"),
+                limit: format!("the robot reaches {reach} m"),
+            });
         }
         if self.kind == Kind::Guarded {
             Guard::of(parameters)?;
         }
         match parameters.text("ToolFrame") {
             None | Some("flange") => Ok(()),
-            Some(_) => Err("ToolFrame is `flange` with this robot".to_owned()),
+            Some(other) => Err(InvalidParameter::Unexpected {
+                name: "ToolFrame".to_owned(),
+                given: Some(other.into()),
+                expected: "is `flange` with this robot".to_owned(),
+            }),
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let (mut guard, hertz) = match self.kind {
             Kind::Guarded => (Some(Guard::of(work.parameters())?), GUARDED),
             Kind::Ptp | Kind::Linear | Kind::Joints => (None, HERTZ),
         };
         let mut session = Session::open(&self.settings, hertz).await?;
         let at = session.state().await?;
-        at.fit()?;
+        at.fit().map_err(UrError::from)?;
         // Differs from the token of the last program of any client.
         let token = at.started.wrapping_add(1) & i32::MAX;
         work.step("Move").await;
@@ -280,9 +288,11 @@ impl Driver for Motion {
 }
 
 impl Motion {
-    fn program(&self, parameters: &Parameters, token: i32) -> Result<String, String> {
-        let missing = |name: &str| format!("{name} is not there");
-        let number = |name: &str| parameters.number(name).ok_or_else(|| missing(name));
+    fn program(&self, parameters: &Parameters, token: i32) -> Result<String, InvalidParameter> {
+        let number = |name: &str| {
+            let number = parameters.number(name);
+            number.ok_or_else(|| InvalidParameter::missing(name, "number"))
+        };
         let line = |target: &str, verb: &str, (a, v): (f64, f64)| {
             format!("{verb}({target}, a={a:.4}, v={v:.4})")
         };
@@ -291,10 +301,7 @@ impl Motion {
             let limits = (number("MaxJointAcceleration")?, number("MaxJointVelocity")?);
             line(&format!("[{target}]"), "movej", limits)
         } else {
-            let target = parameters
-                .six("TargetPosition")
-                .ok_or_else(|| missing("TargetPosition"))?;
-            let pose = listed(to_robot(target));
+            let pose = listed(to_robot(pose_target(parameters)?));
             // The speed of a PTP move is that of the joints. At full reach three joints may add up
             // before the tool is too fast.
             let (verb, by) = match self.kind {
@@ -319,40 +326,56 @@ impl Motion {
     }
 
     /// Sends a program. The connection has to stay open until the robot has accepted the program.
-    async fn send(&self, program: &str) -> Result<TcpStream, String> {
+    async fn send(&self, program: &str) -> Result<TcpStream, UrError> {
         let address = &self.settings.secondary;
-        let unreachable = |error| format!("{address} cannot be reached: {error}");
+        let unreachable = |error| UrError::Unreachable {
+            address: address.clone(),
+            error,
+        };
         let mut stream = connected(address).await.map_err(unreachable)?;
         match timeout(TAKEN, stream.write_all(program.as_bytes())).await {
             Ok(written) => written.map_err(unreachable)?,
-            Err(_) => return Err(format!("{address} takes no program")),
+            Err(_) => {
+                let address = address.clone();
+                return Err(UrError::NotTaken { address });
+            }
         }
         Ok(stream)
     }
 
     /// Stops a robot that moves and whose state is not received. Returns the reason with what was
     /// done.
-    async fn lost(&self, work: &Work, why: &str) -> String {
-        let stopped = match self.send(self.stop_program()).await {
+    async fn lost(&self, work: &Work, why: impl Into<UrError>) -> UrError {
+        let stop = match self.send(self.stop_program()).await {
             Ok(program) => {
                 sleep(SETTLED).await;
                 drop(program);
-                SENT.to_owned()
+                StopProgram::Sent
             }
-            Err(why) => format!("{NOT_SENT}: {why}"),
+            Err(why) => StopProgram::Failed(Box::new(why)),
         };
-        unknown(work, why, &stopped).await
+        unknown(work, why.into(), stop).await
     }
 }
 
+/// Returns the target pose of a move.
+fn pose_target(parameters: &Parameters) -> Result<[f64; 6], InvalidParameter> {
+    let target = parameters.six(TARGET);
+    target.ok_or_else(|| InvalidParameter::missing(TARGET, "six numbers"))
+}
+
 /// Returns the target of a joint move, rad.
-fn joint_target(parameters: &Parameters) -> Result<[f64; 6], String> {
-    let target = parameters.six("TargetJointPosition");
-    let target = target.ok_or("TargetJointPosition has no six numbers")?;
+fn joint_target(parameters: &Parameters) -> Result<[f64; 6], InvalidParameter> {
+    let target = parameters.six(JOINT_TARGET);
+    let target = target.ok_or_else(|| InvalidParameter::missing(JOINT_TARGET, "six numbers"))?;
     match target.iter().find(|joint| joint.abs() > MOST_TURNED) {
-        Some(joint) => Err(format!(
-            "TargetJointPosition has {joint} rad, and the joints turn by {MOST_TURNED:.4} rad to each side"
-        )),
+        Some(joint) => Err(InvalidParameter::Unexpected {
+            name: JOINT_TARGET.to_owned(),
+            given: Some(target.into()),
+            expected: format!(
+                "has {joint} rad, and the joints turn by {MOST_TURNED:.4} rad to each side"
+            ),
+        }),
         None => Ok(target),
     }
 }
@@ -363,10 +386,11 @@ fn listed(numbers: [f64; 6]) -> String {
 }
 
 /// Reports that the robot may move. Returns the reason with what was done.
-async fn unknown(work: &Work, why: &str, stopped: &str) -> String {
-    let why = format!("{why}; the outcome is unknown, {stopped}");
-    work.unknown(&why).await;
-    why
+async fn unknown(work: &Work, why: UrError, stop: StopProgram) -> UrError {
+    let why = Box::new(why);
+    let error = UrError::Unknown { why, stop };
+    work.unknown(error.to_string()).await;
+    error
 }
 
 /// A program that was sent to the robot.
@@ -383,14 +407,14 @@ struct Session {
 }
 
 impl Session {
-    async fn open(settings: &Settings, hertz: f64) -> Result<Self, String> {
+    async fn open(settings: &Settings, hertz: f64) -> Result<Self, UrError> {
         let rtde = Rtde::open(&settings.rtde, hertz, &OUTPUTS, &INPUTS).await?;
         Ok(Self { rtde })
     }
 
-    async fn state(&mut self) -> Result<State, String> {
+    async fn state(&mut self) -> Result<State, UrError> {
         let values = self.rtde.next().await?;
-        State::of(&values).ok_or_else(|| "the robot tells values of other types".to_owned())
+        State::of(&values).ok_or(UrError::OtherTypes)
     }
 
     /// Sets the speed slider.
@@ -401,11 +425,11 @@ impl Session {
         &mut self,
         (motion, work): (&Motion, &Work),
         fraction: f64,
-    ) -> Result<(), String> {
+    ) -> Result<(), UrError> {
         let values = [Value::U32(1), Value::F64(fraction)];
         match self.rtde.tell(&values).await {
             Ok(()) => Ok(()),
-            Err(why) => Err(motion.lost(work, &why).await),
+            Err(why) => Err(motion.lost(work, why).await),
         }
     }
 
@@ -416,20 +440,20 @@ impl Session {
         (motion, work): (&Motion, &Work),
         sent: &mut Sent,
         guard: &mut Option<Guard>,
-    ) -> Result<State, String> {
+    ) -> Result<State, UrError> {
         let token = sent.token;
         let asked = Instant::now();
         let mut standing = None;
         loop {
             let at = match self.state().await {
                 Ok(at) => at,
-                Err(why) => return Err(motion.lost(work, &why).await),
+                Err(why) => return Err(motion.lost(work, why).await),
             };
             if at.done == token {
                 return Ok(at);
             }
             if let Err(why) = at.fit() {
-                return Err(self.unfit((motion, work), sent, (&at, &why)).await?);
+                return Err(self.unfit((motion, work), sent, (&at, why)).await?);
             }
             if let Some(guard) = guard
                 && guard.exceeded(at.force, at.pose)
@@ -438,24 +462,25 @@ impl Session {
                 return self.contact((motion, work), standing, &force).await;
             }
             if at.started == token && at.runtime == STOPPED {
-                return Err("the program of the robot has ended before its move: another one took its place".to_owned());
+                return Err(UrError::Replaced);
             }
             if at.started != token && asked.elapsed() > TAKEN {
-                let why = format!(
-                    "the robot has not taken the program within {TAKEN:?}: is it in remote control?"
-                );
-                return Err(self.withdraw((motion, work), sent, &why).await?);
+                let why = UrError::NotStarted;
+                return Err(self.withdraw((motion, work), sent, why).await?);
             }
             if at.started != token && is(work.stopped()).await {
-                let why = "halted before the robot has taken the program";
+                let why = UrError::HaltedBefore;
                 return Err(self.withdraw((motion, work), sent, why).await?);
             }
             let can_stand = self.rtde.may_tell();
             match (is(work.stopped()).await, is(work.held()).await, standing) {
-                (true, _, standing) => return Err(self.halt((motion, work), standing).await?),
+                (true, _, standing) => {
+                    let stopped = self.halt((motion, work), standing).await?;
+                    return Err(UrError::Stopped(stopped));
+                }
                 (false, true, None) if !can_stand => {
-                    let halted = self.halt((motion, work), None).await?;
-                    return Err(format!("another client has the speed slider: {halted}"));
+                    let stopped = self.halt((motion, work), None).await?;
+                    return Err(UrError::SliderTaken { stopped });
                 }
                 (false, true, None) => {
                     standing = Some(at.slider);
@@ -480,22 +505,22 @@ impl Session {
         &mut self,
         (motion, work): (&Motion, &Work),
         sent: &mut Sent,
-        (at, why): (&State, &str),
-    ) -> Result<String, String> {
+        (at, why): (&State, UnfitRobot),
+    ) -> Result<UrError, UrError> {
         if at.started != sent.token {
-            return self.withdraw((motion, work), sent, why).await;
+            return self.withdraw((motion, work), sent, why.into()).await;
         }
         let program = motion.send(motion.stop_program()).await;
         let until = Instant::now() + BRAKED;
         // The connection is not used after a dropped future.
         while let Ok(Ok(at)) = timeout_at(until, self.state()).await {
             if at.runtime == STOPPED {
-                return Ok(why.to_owned());
+                return Ok(why.into());
             }
         }
-        let stopped = program.map_or(NOT_SENT, |_| SENT);
-        let why = format!("{why}, and its program may go on when it is released");
-        Err(unknown(work, &why, stopped).await)
+        let stop = program.map_or(StopProgram::NotSent, |_| StopProgram::Sent);
+        let why = Box::new(why.into());
+        Err(unknown(work, UrError::MayGoOn { why }, stop).await)
     }
 
     /// Stops a program that the robot has not started. The stop program follows on the same
@@ -508,22 +533,25 @@ impl Session {
         &mut self,
         (motion, work): (&Motion, &Work),
         sent: &mut Sent,
-        why: &str,
-    ) -> Result<String, String> {
+        why: UrError,
+    ) -> Result<UrError, UrError> {
         let stop = motion.stop_program().as_bytes();
         match timeout(BRAKED, sent.stream.write_all(stop)).await {
             Ok(Ok(())) => {}
-            Ok(Err(_)) | Err(_) => return Err(unknown(work, why, NOT_SENT).await),
+            Ok(Err(_)) | Err(_) => return Err(unknown(work, why, StopProgram::NotSent).await),
         }
         let until = Instant::now() + BRAKED;
         // The connection is not used after a dropped future.
         while let Ok(Ok(at)) = timeout_at(until, self.state()).await {
             if at.started == sent.token {
                 let [x, y, z, ..] = self.stand(work).await?.pose;
-                return Ok(format!("{why}; stopped at {x:.3}, {y:.3}, {z:.3} m"));
+                return Ok(UrError::Withdrawn {
+                    why: Box::new(why),
+                    stopped: StoppedRobot([x, y, z]),
+                });
             }
         }
-        Err(unknown(work, why, SENT).await)
+        Err(unknown(work, why, StopProgram::Sent).await)
     }
 
     /// Brakes at the force limit, and returns the state of the robot after that.
@@ -535,19 +563,26 @@ impl Session {
         (motion, work): (&Motion, &Work),
         slider: Option<f64>,
         force: &str,
-    ) -> Result<State, String> {
+    ) -> Result<State, UrError> {
         let braked = self.brake((motion, work), slider).await;
         work.note(force).await;
-        braked.map_err(|why| format!("{force}, and {why}"))
+        braked.map_err(|why| UrError::Contact {
+            force: force.to_owned(),
+            why: Box::new(why),
+        })
     }
 
-    /// Brakes, and returns the position of the robot after that as text.
+    /// Brakes, and returns the position of the robot after that.
     ///
     /// # Errors
     /// As [`brake`](Self::brake).
-    async fn halt(&mut self, of: (&Motion, &Work), slider: Option<f64>) -> Result<String, String> {
+    async fn halt(
+        &mut self,
+        of: (&Motion, &Work),
+        slider: Option<f64>,
+    ) -> Result<StoppedRobot, UrError> {
         let [x, y, z, ..] = self.brake(of, slider).await?.pose;
-        Ok(format!("stopped at {x:.3}, {y:.3}, {z:.3} m"))
+        Ok(StoppedRobot([x, y, z]))
     }
 
     /// Brakes, and returns the state of the robot after that. `slider` is the position of the speed
@@ -559,10 +594,10 @@ impl Session {
         &mut self,
         (motion, work): (&Motion, &Work),
         slider: Option<f64>,
-    ) -> Result<State, String> {
+    ) -> Result<State, UrError> {
         let _program = match motion.send(motion.stop_program()).await {
             Ok(program) => program,
-            Err(why) => return Err(unknown(work, &why, NOT_SENT).await),
+            Err(why) => return Err(unknown(work, why, StopProgram::NotSent).await),
         };
         let at = self.stand(work).await?;
         let Some(slider) = slider else {
@@ -578,7 +613,7 @@ impl Session {
     ///
     /// # Errors
     /// The robot may move: the outcome is unknown.
-    async fn stand(&mut self, work: &Work) -> Result<State, String> {
+    async fn stand(&mut self, work: &Work) -> Result<State, UrError> {
         let asked = Instant::now();
         loop {
             // The connection is not used after a dropped future.
@@ -590,9 +625,9 @@ impl Session {
                 }
                 Ok(Ok(_)) => continue,
                 Ok(Err(why)) => why,
-                Err(_) => format!("the robot is not seen to stop within {BRAKED:?}"),
+                Err(_) => UrError::NotStopped,
             };
-            return Err(unknown(work, &why, SENT).await);
+            return Err(unknown(work, why, StopProgram::Sent).await);
         }
     }
 }
@@ -612,8 +647,9 @@ const HALT: &str = "def ua_halt():\n  stopl(3.0)\nend\n";
 const HALT_JOINTS: &str = "def ua_halt():\n  stopj(3.0)\nend\n";
 /// Largest position of a joint to each side, rad: a full turn.
 const MOST_TURNED: f64 = std::f64::consts::TAU;
-const SENT: &str = "the stop program is sent";
-const NOT_SENT: &str = "the stop program is not sent";
+/// The parameters with the targets of moves.
+const TARGET: &str = "TargetPosition";
+const JOINT_TARGET: &str = "TargetJointPosition";
 const HERTZ: f64 = 50.0;
 /// Rate of the state of a move with a force limit, Hz.
 const GUARDED: f64 = 125.0;

@@ -9,7 +9,8 @@ use std::{error::Error, sync::Arc, time::Duration};
 
 use program::{Method, State};
 use skills::{
-    Authority, Driver, Facts, Owner, Results, Shown, Skill, TypeName, Value, Work, model,
+    Authority, Driver, DriverError, Facts, Owner, Results, Shown, Skill, TypeName, Value, Work,
+    model,
 };
 
 const OPERATOR: Owner = Owner::Local("the example");
@@ -18,7 +19,7 @@ struct Fingers;
 
 #[async_trait::async_trait]
 impl Driver for Fingers {
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let force = work.parameters().number("Force").unwrap_or_default();
         work.step(format!("closing with {force} N")).await;
         for tenth in 1..=10_u8 {

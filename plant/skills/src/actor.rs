@@ -15,7 +15,8 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
 use crate::authority::{Authority, Owner};
-use crate::driver::{Driver, Line, Reins, Results, Signal, Stopped, Work};
+use crate::driver::{Driver, Line, Reins, Results, Signal, Work};
+use crate::driver_error::DriverError;
 use crate::parameters::Parameters;
 use crate::refusal::{Code, Refusal};
 use crate::shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
@@ -89,7 +90,7 @@ pub(crate) struct Actor {
 /// The work of a run, kept until the work has ended.
 struct Running {
     run: RunId,
-    task: JoinHandle<Result<Results, String>>,
+    task: JoinHandle<Result<Results, DriverError>>,
     reins: Reins,
     /// Time limit of the run.
     within: Option<Duration>,
@@ -100,7 +101,7 @@ struct Running {
     left: Option<Duration>,
     /// Result of work that ended while the run was suspended. It is applied when the run is
     /// resumed.
-    ended: Option<Result<Results, String>>,
+    ended: Option<Result<Results, RunFailure>>,
     /// Set after a stop request to work that is done elsewhere, until that work ends.
     halting: Option<Halting>,
     /// Reason why the end of the work is unknown. The end may never become known.
@@ -323,7 +324,7 @@ impl Actor {
         let parameters = Parameters::complete(&self.facts.parameters, prepared)?;
         self.driver
             .check(&parameters)
-            .map_err(|why| Refusal::new(Code::InvalidArgument, why))?;
+            .map_err(|why| Refusal::new(Code::InvalidArgument, why.to_string()))?;
         self.authority.begin(&self.facts.name)?;
         let begun = self.begin(by, is_halted).await;
         let (transition, run) = begun.inspect_err(|_| self.authority.end(&self.facts.name))?;
@@ -470,7 +471,7 @@ impl Actor {
             let ended = outcome_of(ended, &mut work.unknown);
             return match (self.end_stopped(), ended) {
                 (_, Ok(results)) => Stop::Done(results),
-                (true, Err(why)) => Stop::BrokenOff(why),
+                (true, Err(why)) => Stop::BrokenOff(why.to_string()),
                 (false, Err(_)) => Stop::Stopped,
             };
         }
@@ -527,8 +528,8 @@ impl Actor {
                     self.end_stopped();
                     return match ended {
                         Ok(results) => Stop::Done(results),
-                        Err(why) if why == Stopped.to_string() => Stop::Stopped,
-                        Err(why) => Stop::BrokenOff(why),
+                        Err(RunFailure::Driver(DriverError::Stopped)) => Stop::Stopped,
+                        Err(why) => Stop::BrokenOff(why.to_string()),
                     };
                 }
                 Happened::Call(_) | Happened::Progress(_) | Happened::Late => {}
@@ -590,7 +591,7 @@ impl Actor {
     }
 
     /// Handles the end of the work of a run that was asked to stop.
-    fn settle_halted(&mut self, halting: Halting, result: Result<Results, String>) {
+    fn settle_halted(&mut self, halting: Halting, result: Result<Results, RunFailure>) {
         let Halting { message, then, .. } = halting;
         match (result, then) {
             (Ok(results), then) => {
@@ -602,9 +603,9 @@ impl Actor {
                     warn!(skill = self.facts.name, "{refusal}");
                 }
             }
-            (Err(why), Then::End) => self.finish(Err(with(message, &why))),
+            (Err(why), Then::End) => self.finish(Err(why.after(message))),
             (Err(why), Then::Halt) => {
-                let message = with(message, &why);
+                let message = why.after(message).to_string();
                 self.take_steps();
                 self.work = None;
                 self.end_without_work(message.clone());
@@ -616,7 +617,7 @@ impl Actor {
     }
 
     /// Handles the end of work that was not asked to stop.
-    fn settle(&mut self, result: Result<Results, String>) {
+    fn settle(&mut self, result: Result<Results, RunFailure>) {
         self.take_steps();
         let work = self.work.as_mut();
         if work.as_ref().is_some_and(|work| work.unknown.is_some()) {
@@ -637,7 +638,7 @@ impl Actor {
         }
     }
 
-    fn finish(&mut self, result: Result<Results, String>) {
+    fn finish(&mut self, result: Result<Results, RunFailure>) {
         self.work = None;
         let Some(run) = self.program.run() else {
             return;
@@ -649,7 +650,7 @@ impl Actor {
         };
         let message = match &result {
             Ok(_) => format!("run {} is done", run.number()),
-            Err(why) => why.clone(),
+            Err(why) => why.to_string(),
         };
         if result.is_ok() {
             self.now.progress = 1.0;
@@ -837,7 +838,7 @@ enum Happened {
     Call(Call),
     Line(Line),
     Progress(f32),
-    Ended(Result<Results, String>),
+    Ended(Result<Results, RunFailure>),
     Late,
 }
 
@@ -855,11 +856,39 @@ enum Stop {
     Refused(String),
 }
 
-/// Returns the message of a stopped run, with the reason that its work gave.
-fn with(message: String, why: &str) -> String {
-    match why == Stopped.to_string() {
-        true => message,
-        false => format!("{message}; {why}"),
+/// The reason why a run has no results.
+#[derive(Debug, thiserror::Error)]
+enum RunFailure {
+    #[error(transparent)]
+    Driver(#[from] DriverError),
+    /// The driver panicked and has not stopped its machine.
+    #[error("the driver broke down: {panic}; the outcome is unknown, check the machine")]
+    Panicked { panic: String },
+    /// The task of the driver was aborted.
+    #[error("the work was broken off; the outcome is unknown, check the machine")]
+    Aborted,
+    /// The run was stopped, and its work gave this reason.
+    #[error("{message}; {why}")]
+    AfterStop { message: String, why: Box<Self> },
+    /// The run was stopped, and its work had nothing to add.
+    #[error("{0}")]
+    Stopped(String),
+}
+
+impl RunFailure {
+    /// Returns the failure of a run that was stopped with this message.
+    fn after(self, message: String) -> Self {
+        match self {
+            Self::Driver(DriverError::Stopped) => Self::Stopped(message),
+            why @ (Self::Driver(_)
+            | Self::Panicked { .. }
+            | Self::Aborted
+            | Self::AfterStop { .. }
+            | Self::Stopped(_)) => Self::AfterStop {
+                message,
+                why: Box::new(why),
+            },
+        }
     }
 }
 
@@ -897,19 +926,20 @@ async fn happens(work: &mut Option<Running>) -> Happened {
 /// Returns the result of ended work. A driver that panicked has not stopped its machine: `unknown`
 /// then receives the reason.
 fn outcome_of(
-    ended: Result<Result<Results, String>, JoinError>,
+    ended: Result<Result<Results, DriverError>, JoinError>,
     unknown: &mut Option<String>,
-) -> Result<Results, String> {
+) -> Result<Results, RunFailure> {
     let error = match ended {
-        Ok(result) => return result,
+        Ok(result) => return result.map_err(RunFailure::Driver),
         Err(error) => error,
     };
     let why = match error.try_into_panic() {
-        Ok(panic) => format!("the driver broke down: {}", text_of(&*panic)),
-        Err(_) => "the work was broken off".to_owned(),
+        Ok(panic) => RunFailure::Panicked {
+            panic: text_of(&*panic).to_owned(),
+        },
+        Err(_) => RunFailure::Aborted,
     };
-    let why = format!("{why}; the outcome is unknown, check the machine");
-    unknown.get_or_insert_with(|| why.clone());
+    unknown.get_or_insert_with(|| why.to_string());
     Err(why)
 }
 

@@ -12,6 +12,7 @@
 //! - `mirror`: the skills of a server, presented like local skills
 //! - `detector`: the skills of all servers
 //! - `peers`: how the skills of a component reach other components
+//! - `partner_error`: the reasons why a component is not found, or does not fit
 //! - `choice`: the robot, the tool and the object of a pick and place
 //! - `remote`: a composite of the skills of several servers
 
@@ -24,6 +25,7 @@ mod grip;
 mod handle;
 mod mirror;
 pub(crate) mod packed;
+mod partner_error;
 mod peers;
 mod remote;
 #[cfg(test)]
@@ -44,6 +46,9 @@ pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
 pub use mirror::{Mirror, Mirrors, Watchable};
+pub use partner_error::{
+    FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
+};
 pub use peers::PeerAccess;
 pub use remote::Remote;
 pub use states::SkillStates;

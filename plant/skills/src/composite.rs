@@ -8,6 +8,7 @@ use async_trait::async_trait;
 use tracing::{debug, warn};
 
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::{DriverError, InvalidParameter};
 use crate::frame::Frame;
 use crate::grip::{Hold, PartShape};
 use crate::parameters::Parameters;
@@ -328,31 +329,29 @@ impl Driver for PickAndPlace {
         Some(COMPOSITE_HALT_TIMEOUT)
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         job(parameters).map(drop)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let job = job(work.parameters())?;
-        Self::run(self, &job, &work)
-            .await
-            .map_err(|broken| broken.to_string())?;
+        Self::run(self, &job, &work).await?;
         Ok(Vec::new())
     }
 }
 
-pub(crate) fn job(parameters: &Parameters) -> Result<Job, String> {
+pub(crate) fn job(parameters: &Parameters) -> Result<Job, InvalidParameter> {
     let six = |name: &str| {
         parameters
             .six(name)
-            .ok_or_else(|| format!("{name} has no six numbers"))
+            .ok_or_else(|| InvalidParameter::missing(name, "six numbers"))
     };
     Ok(Job {
         pick: six("PickPosition")?,
         place: six("PlacePosition")?,
         approach: parameters
             .number("ApproachOffset")
-            .ok_or("ApproachOffset is no number")?,
+            .ok_or_else(|| InvalidParameter::missing("ApproachOffset", "number"))?,
         shape: None,
     })
 }

@@ -14,6 +14,7 @@ use serde_json::Value as Json;
 use tokio::sync::watch;
 
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::{Parameter, Parameters, shortened};
 use crate::value::Value;
 use crate::values::ValueFacts;
@@ -302,7 +303,7 @@ impl Driver for Configured {
         self.driver.halt_timeout()
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         self.driver.check(parameters)
     }
 
@@ -343,7 +344,7 @@ impl Driver for Configured {
         given
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let configured: Vec<(String, Value)> = self
             .configuration
             .of_skill(&self.skill)
@@ -475,7 +476,7 @@ mod tests {
 
     #[async_trait]
     impl Driver for Recorder {
-        async fn run(&self, work: Work) -> Result<Results, String> {
+        async fn run(&self, work: Work) -> Result<Results, DriverError> {
             let force = work.parameters().number("Force").unwrap();
             let configured = work.configuration().len();
             self.0.lock().unwrap().push((force, configured));

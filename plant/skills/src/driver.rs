@@ -5,6 +5,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use tokio::sync::{mpsc, watch};
 
+use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::{Parameter, Parameters};
 use crate::value::Value;
 
@@ -33,9 +34,8 @@ pub trait Driver: Send + Sync + 'static {
     /// Checks parameters that match the type, before anything moves.
     ///
     /// # Errors
-    /// A message that starts with the name of an invalid parameter. The client receives
-    /// BadInvalidArgument.
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    /// [`InvalidParameter`]. The client receives BadInvalidArgument.
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         let _any = parameters;
         Ok(())
     }
@@ -61,8 +61,9 @@ pub trait Driver: Send + Sync + 'static {
     /// [`halt_timeout`](Self::halt_timeout).
     ///
     /// # Errors
-    /// The reason why the work is not done, as text for people.
-    async fn run(&self, work: Work) -> Result<Results, String>;
+    /// The reason why the work is not done. [`DriverError::Stopped`] is work that ended because of
+    /// Halt, with nothing to add.
+    async fn run(&self, work: Work) -> Result<Results, DriverError>;
 }
 
 /// A run, as its driver sees it.
@@ -94,12 +95,6 @@ pub(crate) enum Line {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("stopped")]
 pub struct Stopped;
-
-impl From<Stopped> for String {
-    fn from(stopped: Stopped) -> Self {
-        stopped.to_string()
-    }
-}
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Signal {

@@ -122,13 +122,31 @@ impl FromStr for PartShape {
     }
 }
 
+/// The reason why a gripper cannot hold a part.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum GripError {
+    /// The part is wider than the gripper opens, or narrower than it closes.
+    #[error("the part is {width} m wide, and the gripper holds from {least} to {most} m")]
+    Width {
+        /// The width of the part, m.
+        width: f64,
+        /// The smallest width that the gripper holds, m.
+        least: f64,
+        /// The largest width that the gripper holds, m.
+        most: f64,
+    },
+    /// Vacuum needs a flat top.
+    #[error("the part has no flat top for vacuum")]
+    NoFlatTop,
+}
+
 impl GripPoint {
     /// Returns the pose of the grip point in the frame of the part, for a grasp from above: vacuum
     /// holds the top of the part, fingers hold its sides at half of its height.
     ///
     /// # Errors
-    /// The reason why this gripper cannot hold a part of this shape, for users.
-    pub fn on(&self, shape: Option<&PartShape>) -> Result<Frame, String> {
+    /// [`GripError`].
+    pub fn on(&self, shape: Option<&PartShape>) -> Result<Frame, GripError> {
         let (height, turn) = match (self.grip_type, shape) {
             (Some(GripType::Vacuum), Some(shape)) => (shape.flat_top()? / 2.0, 0.0),
             (Some(GripType::Parallel), Some(shape)) => (0.0, self.turn(shape)?),
@@ -145,7 +163,7 @@ impl GripPoint {
 
     /// Returns the rotation about the z axis of the part with which the part fits between two
     /// fingers, rad.
-    fn turn(&self, shape: &PartShape) -> Result<f64, String> {
+    fn turn(&self, shape: &PartShape) -> Result<f64, GripError> {
         let (x, y) = shape.widths();
         match (self.fits(x), self.fits(y)) {
             (Ok(()), _) => Ok(0.0),
@@ -154,11 +172,11 @@ impl GripPoint {
         }
     }
 
-    fn fits(&self, width: f64) -> Result<(), String> {
+    fn fits(&self, width: f64) -> Result<(), GripError> {
         match self.opening {
-            Some((least, most)) if !(least..=most).contains(&width) => Err(format!(
-                "the part is {width} m wide, and the gripper holds from {least} to {most} m"
-            )),
+            Some((least, most)) if !(least..=most).contains(&width) => {
+                Err(GripError::Width { width, least, most })
+            }
             Some(_) | None => Ok(()),
         }
     }
@@ -174,10 +192,10 @@ impl PartShape {
     }
 
     /// Returns the height of a part with a flat top, m.
-    fn flat_top(&self) -> Result<f64, String> {
+    fn flat_top(&self) -> Result<f64, GripError> {
         match *self {
             Self::Box([_, _, height]) | Self::Cylinder { height, .. } => Ok(height),
-            Self::Sphere(_) => Err("the part has no flat top for vacuum".to_owned()),
+            Self::Sphere(_) => Err(GripError::NoFlatTop),
         }
     }
 }
@@ -205,7 +223,7 @@ impl Hold {
         grip: Option<&GripPoint>,
         plate: &Frame,
         shape: Option<&PartShape>,
-    ) -> Result<Self, String> {
+    ) -> Result<Self, GripError> {
         let Some(grip) = grip else {
             return Ok(Self { flange: None });
         };
@@ -275,12 +293,12 @@ mod tests {
         let wide = PartShape::Box([0.12, 0.1, 0.06]);
         let why = FINGERS.on(Some(&wide)).unwrap_err();
         assert_eq!(
-            why,
+            why.to_string(),
             "the part is 0.12 m wide, and the gripper holds from 0 to 0.085 m"
         );
         let ball = PartShape::Sphere(0.03);
         let why = CUP.on(Some(&ball)).unwrap_err();
-        assert_eq!(why, "the part has no flat top for vacuum");
+        assert_eq!(why, GripError::NoFlatTop);
         assert!(FINGERS.on(Some(&ball)).is_ok() && CUP.on(None).is_ok());
     }
 

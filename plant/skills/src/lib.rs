@@ -13,6 +13,7 @@ mod composite;
 mod configuration;
 pub mod conformance;
 mod driver;
+mod driver_error;
 pub mod frame;
 mod grip;
 pub mod model;
@@ -32,9 +33,10 @@ pub mod yaml;
 
 pub use authority::{Authority, Owner};
 pub use client::{
-    Chosen, ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, Mirror,
-    Mirrors, Needs, PeerAccess, RemoteState, SkillClient, SkillHandle, SkillStates, StationChanges,
-    ToolState, Watchable,
+    Chosen, ClientOptions, Detected, Detector, FailedLocator, FoundParameter, FoundSkill,
+    FoundType, LocatorError, Mirror, Mirrors, Needs, NotLocated, PartnerError, PeerAccess,
+    RemoteState, SkillClient, SkillHandle, SkillStates, StationChanges, ToolState, Unchosen,
+    UnfitGrasp, Watchable,
 };
 pub use component::{
     Asked, Change, ChangeKind, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers,
@@ -46,7 +48,8 @@ pub use component::{
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use configuration::{Configurable, Configuration, Effect, NotConfigured};
 pub use driver::{Driver, Results, Stopped, Work};
-pub use grip::{GripPoint, GripType, NoShape, PartShape};
+pub use driver_error::{DriverError, InvalidParameter};
+pub use grip::{GripError, GripPoint, GripType, NoShape, PartShape};
 pub use model::NAMESPACE;
 pub use parameters::{NoTypeName, Parameter, Parameters, TypeName};
 pub use part::{PartEnd, run_part};
@@ -59,4 +62,4 @@ pub use values::{
     DeviceValue, LiveValue, Measure, Measured, Reading, Sensor, Statistics, Tally, ValueFacts,
 };
 pub use variant::{from_variant, to_variant};
-pub use workspace::{Workspace, Zone};
+pub use workspace::{OutOfWorkspace, Workspace, Zone};

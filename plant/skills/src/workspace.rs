@@ -5,6 +5,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::{Parameter, Parameters};
 use crate::value::Value;
 
@@ -28,18 +29,47 @@ pub struct Zone {
     pub high: [f64; 3],
 }
 
+/// A position that a robot does not reach.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum OutOfWorkspace {
+    /// The position is too far from the base.
+    #[error("{} is {far:.3} m from its base, and it reaches {reach} m", metres(*position))]
+    Reach {
+        /// The position, m.
+        position: [f64; 3],
+        /// Its distance from the base, m.
+        far: f64,
+        /// The largest distance, m.
+        reach: f64,
+    },
+    /// The position is in no zone.
+    #[error("{} is in none of its zones: {}", metres(*position), zones.join(", "))]
+    Zones {
+        /// The position, m.
+        position: [f64; 3],
+        /// The names of the zones.
+        zones: Vec<String>,
+    },
+}
+
+fn metres([x, y, z]: [f64; 3]) -> String {
+    format!("{x:.3}, {y:.3}, {z:.3} m")
+}
+
 impl Workspace {
     /// Checks that a position is within the reach and in a zone.
     ///
     /// # Errors
-    /// The reason why the robot does not go there.
-    pub fn allows(&self, position: [f64; 3]) -> Result<(), String> {
+    /// [`OutOfWorkspace`].
+    pub fn allows(&self, position: [f64; 3]) -> Result<(), OutOfWorkspace> {
         let [x, y, z] = position;
         let far = (x * x + y * y + z * z).sqrt();
         if let Some(reach) = self.reach.filter(|reach| far > *reach) {
-            return Err(format!(
-                "{x:.3}, {y:.3}, {z:.3} m is {far:.3} m from its base, and it reaches {reach} m"
-            ));
+            return Err(OutOfWorkspace::Reach {
+                position,
+                far,
+                reach,
+            });
         }
         let is_in = |zone: &Zone| {
             let bounds = zone.low.iter().zip(zone.high);
@@ -51,11 +81,8 @@ impl Workspace {
         if self.zones.is_empty() || self.zones.iter().any(is_in) {
             return Ok(());
         }
-        let names: Vec<&str> = self.zones.iter().map(|zone| zone.name.as_str()).collect();
-        Err(format!(
-            "{x:.3}, {y:.3}, {z:.3} m is in none of its zones: {}",
-            names.join(", ")
-        ))
+        let zones = self.zones.iter().map(|zone| zone.name.clone()).collect();
+        Err(OutOfWorkspace::Zones { position, zones })
     }
 
     /// Checks that all positions are within the reach and in a zone.
@@ -69,17 +96,20 @@ impl Workspace {
     /// Checks the target of a move among the parameters of a skill.
     ///
     /// # Errors
-    /// The reason why the robot does not go there, after the name of the parameter.
+    /// [`InvalidParameter::OutOfWorkspace`].
     pub fn allows_target<'p>(
         &self,
         mut parameters: impl Iterator<Item = &'p (String, Value)>,
-    ) -> Result<(), String> {
+    ) -> Result<(), InvalidParameter> {
         let target = parameters.find(|(name, _)| name == TARGET);
         let target = target.and_then(|(_, value)| value.as_f64s());
         match target.as_deref() {
             Some([x, y, z, ..]) => {
                 let allowed = self.allows([*x, *y, *z]);
-                allowed.map_err(|why| format!("{TARGET}: {why}"))
+                allowed.map_err(|why| InvalidParameter::OutOfWorkspace {
+                    name: TARGET.to_owned(),
+                    why,
+                })
             }
             Some(_) | None => Ok(()),
         }
@@ -135,7 +165,7 @@ impl Driver for Bounded {
         self.driver.halt_timeout()
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         self.workspace.allows_target(parameters.all().iter())?;
         self.driver.check(parameters)
     }
@@ -152,7 +182,7 @@ impl Driver for Bounded {
         self.driver.uses()
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         self.driver.run(work).await
     }
 }
@@ -193,7 +223,8 @@ mod tests {
                 "is 1.025 m from its base, and it reaches 1 m",
             ),
         ] {
-            let why = workspace.allows(position).err().unwrap_or_default();
+            let why = workspace.allows(position).err();
+            let why = why.map(|why| why.to_string()).unwrap_or_default();
             assert!(
                 why.ends_with(expected) && why.is_empty() == expected.is_empty(),
                 "{why}"
@@ -201,7 +232,7 @@ mod tests {
         }
         let target = [("TargetPosition".to_owned(), Value::from([2.0; 6]))];
         let why = workspace.allows_target(target.iter()).unwrap_err();
-        assert!(why.starts_with("TargetPosition: "), "{why}");
+        assert!(why.to_string().starts_with("TargetPosition: "), "{why}");
         assert_eq!(Workspace::default().allows([9.0, 0.0, 0.0]), Ok(()));
     }
 }

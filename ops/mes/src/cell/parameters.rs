@@ -49,7 +49,8 @@ pub(super) fn values(found: &FoundSkill, given: &[Given]) -> Result<Vec<(String,
         .filter_map(|given| value(given).transpose())
         .collect::<Result<_, _>>()?;
     if let Some(workspace) = &found.workspace {
-        workspace.allows_target(values.iter())?;
+        let allowed = workspace.allows_target(values.iter());
+        allowed.map_err(|why| why.to_string())?;
     }
     Ok(values)
 }

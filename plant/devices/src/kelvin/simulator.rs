@@ -10,7 +10,7 @@ use tracing::debug;
 
 use super::{DIVIDER, Reading, volts};
 use crate::modbus::server::{Registers, Table};
-use crate::ur::Follower;
+use crate::ur::{Follower, RtdeError};
 
 /// A dock, with the tool that is in it at first.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -72,7 +72,7 @@ impl Simulator {
         Following { _tasks: tasks }
     }
 
-    async fn followed(&self, rtde: &str) -> Result<(), String> {
+    async fn followed(&self, rtde: &str) -> Result<(), RtdeError> {
         let mut follower = Follower::open(rtde).await?;
         loop {
             self.flange_at(follower.position().await?);

@@ -26,6 +26,11 @@ impl fmt::Display for Reading {
     }
 }
 
+/// A voltage that is no level of the tool changer.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+#[error("{0:.2} V is no voltage of the tool changer")]
+pub struct InvalidVoltage(pub f64);
+
 /// The voltages at the changer in V, ascending.
 pub const LEVELS: [(f64, Reading); 13] = [
     (0.0, Reading::Ready),
@@ -63,11 +68,11 @@ impl Detector {
     /// Returns the reading of a voltage, which depends on the previous voltages.
     ///
     /// # Errors
-    /// Fails if the voltage is not a valid level of the changer.
-    pub fn feed(&mut self, volts: f64) -> Result<Reading, String> {
+    /// [`InvalidVoltage`].
+    pub fn feed(&mut self, volts: f64) -> Result<Reading, InvalidVoltage> {
         if !(LOWEST..=HIGHEST).contains(&volts) {
             self.now = None;
-            return Err(format!("{volts:.2} V is no voltage of the tool changer"));
+            return Err(InvalidVoltage(volts));
         }
         let mut place = LEVELS
             .windows(2)
@@ -83,7 +88,7 @@ impl Detector {
         }
         self.now = Some(place);
         let level = LEVELS.get(place).map(|(_, reading)| *reading);
-        level.ok_or_else(|| format!("{volts:.2} V is no voltage of the tool changer"))
+        level.ok_or(InvalidVoltage(volts))
     }
 }
 
@@ -106,9 +111,10 @@ mod tests {
             assert_eq!(Detector::default().feed(volts), Ok(reading));
             assert_eq!(super::volts(reading), volts);
         }
+        assert_eq!(Detector::default().feed(-1.0), Err(InvalidVoltage(-1.0)));
         assert_eq!(
-            Detector::default().feed(-1.0),
-            Err("-1.00 V is no voltage of the tool changer".to_owned())
+            InvalidVoltage(-1.0).to_string(),
+            "-1.00 V is no voltage of the tool changer"
         );
         assert!(Detector::default().feed(f64::NAN).is_err());
         assert!(Detector::default().feed(24.0).is_err());

@@ -10,6 +10,7 @@ use mtp::{Bound, Node, Parameter, Procedure, Role, Service};
 use skills::{ClientOptions, Value};
 use tokio::time::{Instant, sleep};
 
+use super::error::{ModuleError, NodeError};
 use super::is_equal;
 
 /// Access to the nodes of a module.
@@ -23,20 +24,20 @@ pub trait ModuleNodes: Send + Sync + 'static {
     /// Waits until the server of a node can be reached.
     ///
     /// # Errors
-    /// The reason why it cannot, as text for people.
-    async fn connect(&self, node: &Node, within: Duration) -> Result<(), String>;
+    /// [`NodeError::Unreachable`].
+    async fn connect(&self, node: &Node, within: Duration) -> Result<(), NodeError>;
 
     /// Reads the values of nodes of one server; `None` for bad values.
     ///
     /// # Errors
     /// There is no response.
-    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, String>;
+    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, NodeError>;
 
     /// Writes a value in the type of the node.
     ///
     /// # Errors
     /// The value was refused, or there is no response.
-    async fn write(&self, node: &Node, value: Value) -> Result<(), String>;
+    async fn write(&self, node: &Node, value: Value) -> Result<(), NodeError>;
 }
 
 /// Time limits of a module.
@@ -92,7 +93,7 @@ impl std::fmt::Display for StateWord {
 
 impl Handshake<'_> {
     /// Reads the state of the service.
-    pub(super) async fn state(&self) -> Result<StateWord, String> {
+    pub(super) async fn state(&self) -> Result<StateWord, ModuleError> {
         let node = self.needed(Role::State, "StateCur")?;
         let word = self.word(node, "StateCur").await?;
         Ok(match State::of_bit(word) {
@@ -102,7 +103,7 @@ impl Handshake<'_> {
     }
 
     /// Requests automatic mode and the external source, and waits for both.
-    pub(super) async fn mode(&self) -> Result<(), String> {
+    pub(super) async fn mode(&self) -> Result<(), ModuleError> {
         if let Some(node) = self.node(Role::OperationMode) {
             return self.mode_word(node).await;
         }
@@ -127,7 +128,7 @@ impl Handshake<'_> {
     }
 
     /// Requests the mode by the word of early drafts, which confirms automatic mode only.
-    async fn mode_word(&self, node: &Node) -> Result<(), String> {
+    async fn mode_word(&self, node: &Node) -> Result<(), ModuleError> {
         let word = self.word(node, "OpMode").await?;
         if word & OP_MODE_AUTOMATIC_ACTIVE == 0 {
             self.write(node, Value::UInt32(OP_MODE_AUTOMATIC), "OpMode")
@@ -147,7 +148,7 @@ impl Handshake<'_> {
         active: Option<&Node>,
         requests: [Option<&Node>; 2],
         what: &str,
-    ) -> Result<(), String> {
+    ) -> Result<(), ModuleError> {
         let Some(active) = active else { return Ok(()) };
         if self.is_true(active).await? {
             return Ok(());
@@ -155,9 +156,8 @@ impl Handshake<'_> {
         // A request that cannot be written from outside belongs to the automation of the module.
         let mut requests = requests.into_iter().flatten();
         let Some(request) = requests.find(|node| node.access.writes) else {
-            return Err(format!(
-                "{what} is not active, and the manifest has no node to request it"
-            ));
+            let what = what.to_owned();
+            return Err(ModuleError::NoRequest { what });
         };
         self.write(request, Value::Boolean(true), what).await?;
         let is_active = |value: &Value| *value == Value::Boolean(true);
@@ -165,12 +165,12 @@ impl Handshake<'_> {
     }
 
     /// Selects a procedure, and waits until the service has accepted the selection.
-    pub(super) async fn select(&self, procedure: &Procedure) -> Result<(), String> {
+    pub(super) async fn select(&self, procedure: &Procedure) -> Result<(), ModuleError> {
         let Some(node) = self.node(Role::ProcedureWanted) else {
             let is_only = self.service.procedures.len() == 1;
             return match is_only {
                 true => Ok(()),
-                false => Err("the manifest has no node to select the procedure".to_owned()),
+                false => Err(ModuleError::NoSelection),
             };
         };
         let number = procedure.number;
@@ -187,10 +187,11 @@ impl Handshake<'_> {
         &self,
         parameter: &Parameter,
         value: &Value,
-    ) -> Result<(), String> {
+    ) -> Result<(), ModuleError> {
         let name = &parameter.name;
         let Some(node) = &parameter.write else {
-            return Err(format!("{name} has no node for writing"));
+            let parameter = name.clone();
+            return Err(ModuleError::NotWritable { parameter });
         };
         self.limits(parameter, value).await?;
         self.external(parameter).await?;
@@ -248,7 +249,7 @@ impl Handshake<'_> {
     }
 
     /// Checks the limits that the file or the module has.
-    async fn limits(&self, parameter: &Parameter, value: &Value) -> Result<(), String> {
+    async fn limits(&self, parameter: &Parameter, value: &Value) -> Result<(), ModuleError> {
         let Some(number) = value.as_f64() else {
             return Ok(());
         };
@@ -272,20 +273,18 @@ impl Handshake<'_> {
             return Ok(());
         }
         if low.is_some_and(|low| number < low) || high.is_some_and(|high| number > high) {
-            let shown =
-                |limit: Option<f64>| limit.map_or_else(|| "any".to_owned(), |one| one.to_string());
-            return Err(format!(
-                "{} is from {} to {} in the module, and {number} was given",
-                parameter.name,
-                shown(low),
-                shown(high)
-            ));
+            return Err(ModuleError::OutOfRange {
+                parameter: parameter.name.clone(),
+                low,
+                high,
+                given: number,
+            });
         }
         Ok(())
     }
 
     /// Returns whether the service allows a command; true if it does not say so.
-    pub(super) async fn allows(&self, command: Command) -> Result<bool, String> {
+    pub(super) async fn allows(&self, command: Command) -> Result<bool, ModuleError> {
         match self.node(Role::CommandEnabled) {
             Some(node) => Ok(self.word(node, "CommandEn").await? & command.bit() != 0),
             None => Ok(true),
@@ -293,7 +292,7 @@ impl Handshake<'_> {
     }
 
     /// Waits until the service allows a command.
-    pub(super) async fn allowed(&self, command: Command) -> Result<(), String> {
+    pub(super) async fn allowed(&self, command: Command) -> Result<(), ModuleError> {
         let Some(node) = self.node(Role::CommandEnabled) else {
             return Ok(());
         };
@@ -303,7 +302,7 @@ impl Handshake<'_> {
     }
 
     /// Writes a command. A command that the service left in place is removed before.
-    pub(super) async fn command(&self, command: Command) -> Result<(), String> {
+    pub(super) async fn command(&self, command: Command) -> Result<(), ModuleError> {
         let node = self.needed(Role::Command, "CommandExt")?;
         if self.word(node, "CommandExt").await? != 0 {
             self.write(node, Value::UInt32(0), "CommandExt").await?;
@@ -313,7 +312,7 @@ impl Handshake<'_> {
     }
 
     /// Removes a command that the service did not remove, so that it has no effect later.
-    pub(super) async fn withdraw(&self) -> Result<(), String> {
+    pub(super) async fn withdraw(&self) -> Result<(), ModuleError> {
         let node = self.needed(Role::Command, "CommandExt")?;
         if self.word(node, "CommandExt").await? != 0 {
             self.write(node, Value::UInt32(0), "CommandExt").await?;
@@ -325,8 +324,8 @@ impl Handshake<'_> {
     pub(super) async fn until(
         &self,
         is: impl Fn(StateWord) -> bool,
-        (what, within): (&str, Duration),
-    ) -> Result<StateWord, String> {
+        (what, within): (&'static str, Duration),
+    ) -> Result<StateWord, ModuleError> {
         let end = Instant::now() + within;
         loop {
             let state = self.state().await;
@@ -334,9 +333,16 @@ impl Handshake<'_> {
                 Ok(state) if is(state) => return Ok(state),
                 _ if Instant::now() < end => sleep(self.timing.poll).await,
                 Ok(state) => {
-                    return Err(format!("{what}: the service is {state} after {within:?}"));
+                    return Err(ModuleError::NotReached {
+                        what,
+                        state,
+                        within,
+                    });
                 }
-                Err(why) => return Err(format!("{what}: {why}")),
+                Err(why) => {
+                    let why = Box::new(why);
+                    return Err(ModuleError::NoState { what, why });
+                }
             }
         }
     }
@@ -346,7 +352,7 @@ impl Handshake<'_> {
         node: &Node,
         is: impl Fn(&Value) -> bool,
         what: &str,
-    ) -> Result<(), String> {
+    ) -> Result<(), ModuleError> {
         let within = self.timing.handshake;
         let end = Instant::now() + within;
         loop {
@@ -356,29 +362,37 @@ impl Handshake<'_> {
                 return Ok(());
             }
             if Instant::now() >= end {
-                let found = value.map_or_else(|| "no value".to_owned(), |value| value.to_string());
-                return Err(format!(
-                    "{what} was not confirmed within {within:?}: {} has {found}",
-                    node.id()
-                ));
+                return Err(ModuleError::NotConfirmed {
+                    what: what.to_owned(),
+                    within,
+                    node: node.id(),
+                    value,
+                });
             }
             sleep(self.timing.poll).await;
         }
     }
 
-    async fn write(&self, node: &Node, value: Value, what: &str) -> Result<(), String> {
+    async fn write(&self, node: &Node, value: Value, what: &str) -> Result<(), ModuleError> {
         let written = self.nodes.write(node, value).await;
-        written.map_err(|why| format!("cannot write {what} ({}): {why}", node.id()))
+        written.map_err(|error| ModuleError::Write {
+            what: what.to_owned(),
+            node: node.id(),
+            error,
+        })
     }
 
-    async fn word(&self, node: &Node, what: &str) -> Result<u32, String> {
+    async fn word(&self, node: &Node, what: &str) -> Result<u32, ModuleError> {
         let read = self.nodes.read(&[node]).await?;
         let value = read.into_iter().next().flatten();
-        let value = value.ok_or_else(|| format!("{what} ({}) has no value", node.id()))?;
+        let value = value.ok_or_else(|| ModuleError::NoValue {
+            what: what.to_owned(),
+            node: node.id(),
+        })?;
         Ok(as_word(&value))
     }
 
-    async fn is_true(&self, node: &Node) -> Result<bool, String> {
+    async fn is_true(&self, node: &Node) -> Result<bool, ModuleError> {
         let read = self.nodes.read(&[node]).await?;
         Ok(read.into_iter().next().flatten() == Some(Value::Boolean(true)))
     }
@@ -387,9 +401,12 @@ impl Handshake<'_> {
         self.service.control.node(role)
     }
 
-    fn needed(&self, role: Role, name: &str) -> Result<&Node, String> {
+    pub(super) fn needed(&self, role: Role, name: &'static str) -> Result<&Node, ModuleError> {
         let node = self.node(role);
-        node.ok_or_else(|| format!("the manifest has no {name} for {}", self.service.name))
+        node.ok_or_else(|| ModuleError::NoNode {
+            node: name,
+            service: self.service.name.clone(),
+        })
     }
 }
 

@@ -10,6 +10,7 @@ use plant_opcua::client::{Client, ClientConfig};
 use plant_opcua::types::{NodeId, Variant};
 use skills::{ClientOptions, Shape, Value, from_variant, to_variant};
 
+use super::error::NodeError;
 use super::handshake::ModuleNodes;
 
 /// Clients of the servers of a module. Each is opened at the first connection, and reconnects by
@@ -55,13 +56,16 @@ impl ModuleNodes for UaNodes {
         known.clone_from(options);
     }
 
-    async fn connect(&self, node: &Node, within: Duration) -> Result<(), String> {
+    async fn connect(&self, node: &Node, within: Duration) -> Result<(), NodeError> {
         let endpoint = self.endpoint.as_ref().unwrap_or(&node.endpoint);
         let connected = self.client(node).up(within).await;
-        connected.map_err(|error| format!("cannot connect to the module at {endpoint}: {error}"))
+        connected.map_err(|error| NodeError::Unreachable {
+            endpoint: endpoint.clone(),
+            error,
+        })
     }
 
-    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, String> {
+    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, NodeError> {
         let Some(first) = nodes.first() else {
             return Ok(Vec::new());
         };
@@ -70,7 +74,7 @@ impl ModuleNodes for UaNodes {
             .iter()
             .map(|node| node_id(&client, node))
             .collect::<Result<_, _>>()?;
-        let values = client.read(&ids).await.map_err(|error| error.to_string())?;
+        let values = client.read(&ids).await?;
         let good = values.into_iter().map(|value| {
             let is_good = value.status.is_none_or(|status| status.is_good());
             value.value.filter(|_| is_good)
@@ -78,7 +82,7 @@ impl ModuleNodes for UaNodes {
         Ok(good.map(|value| from_variant(&value?)).collect())
     }
 
-    async fn write(&self, node: &Node, value: Value) -> Result<(), String> {
+    async fn write(&self, node: &Node, value: Value) -> Result<(), NodeError> {
         let client = self.client(node);
         let id = node_id(&client, node)?;
         let [known] = self.read(&[node]).await?.try_into().unwrap_or([None]);
@@ -87,28 +91,24 @@ impl ModuleNodes for UaNodes {
             // A node without a value has no type here; the server checks the type.
             None => to_variant(&value),
         };
-        let written = client.write(&[(id, variant)]).await;
-        let statuses = written.map_err(|error| error.to_string())?;
+        let statuses = client.write(&[(id, variant)]).await?;
         match statuses.first() {
             Some(status) if status.is_good() => Ok(()),
-            Some(status) => Err(status.to_string()),
-            None => Err("the server gave no result".to_owned()),
+            Some(status) => Err(NodeError::Refused(*status)),
+            None => Err(NodeError::NoResult),
         }
     }
 }
 
 /// Returns the NodeId of a node in the namespaces of a server.
-fn node_id(client: &Client, node: &Node) -> Result<NodeId, String> {
+fn node_id(client: &Client, node: &Node) -> Result<NodeId, NodeError> {
     let index = match node.namespace.parse() {
         // Some manifests have an index in place of a URI.
         Ok(index) => Some(index),
         Err(_) => client.namespace(&node.namespace),
     };
-    let index: u16 = index.ok_or_else(|| {
-        format!(
-            "the server of the module has no namespace {}",
-            node.namespace
-        )
+    let index: u16 = index.ok_or_else(|| NodeError::NoNamespace {
+        namespace: node.namespace.clone(),
     })?;
     Ok(match &node.identifier {
         Identifier::Numeric(number) => NodeId::new(index, *number),
@@ -117,7 +117,7 @@ fn node_id(client: &Client, node: &Node) -> Result<NodeId, String> {
 }
 
 /// Converts a value to the type of the present value of a node.
-fn in_type_of(known: &Value, value: &Value) -> Result<Variant, String> {
+fn in_type_of(known: &Value, value: &Value) -> Result<Variant, NodeError> {
     let shape: Shape = known.shape();
     let is_same = value.shape() == shape;
     let converted = match (known, value.as_f64()) {
@@ -130,6 +130,9 @@ fn in_type_of(known: &Value, value: &Value) -> Result<Variant, String> {
         (Value::Boolean(_) | Value::String(_), _) => None,
         _ => shape.read_json(&value.to_json()).ok(),
     };
-    let converted = converted.ok_or_else(|| format!("{value} is no {shape}"))?;
+    let converted = converted.ok_or_else(|| NodeError::WrongType {
+        value: value.clone(),
+        shape,
+    })?;
     Ok(to_variant(&converted))
 }

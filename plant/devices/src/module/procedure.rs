@@ -6,10 +6,11 @@ use std::time::Duration;
 use async_trait::async_trait;
 use mtp::state::{Command, State};
 use mtp::{Output, OutputRole, Parameter, Procedure, Role, Service};
-use skills::{Driver, Results, Value, Work};
+use skills::{Driver, DriverError, InvalidParameter, Results, Value, Work};
 use tokio::sync::Mutex;
 use tokio::time::{Instant, sleep};
 
+use super::error::ModuleError;
 use super::handshake::{Handshake, ModuleNodes, StateWord, Timing};
 use super::is_equal;
 
@@ -32,6 +33,14 @@ pub(super) fn outputs<'s>(
     all.filter(|output| output.role != OutputRole::ProcessValueIn && output.node.is_some())
 }
 
+/// The end of a suspension.
+enum Suspended {
+    /// The service was continued, or has completed.
+    Resumed,
+    /// The run is to be stopped.
+    Stopped,
+}
+
 #[async_trait]
 impl Driver for Run {
     fn can_suspend(&self) -> bool {
@@ -42,12 +51,10 @@ impl Driver for Run {
         Some(self.timing.stop + self.timing.handshake)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let Ok(_alone) = self.busy.try_lock() else {
-            return Err(format!(
-                "the service {} runs another procedure",
-                self.service.name
-            ));
+            let service = self.service.name.clone();
+            return Err(ModuleError::Busy { service }.into());
         };
         let shake = Handshake {
             service: &self.service,
@@ -59,20 +66,19 @@ impl Driver for Run {
             () = work.stopped() => {
                 // A Reset that was written has no effect later.
                 let _removed = shake.withdraw().await;
-                return Err("stopped before Start".to_owned());
+                return Err(ModuleError::StoppedBeforeStart.into());
             }
         }
         self.start(&shake, &work).await?;
-        self.follow(&shake, &work).await
+        Ok(self.follow(&shake, &work).await?)
     }
 }
 
 impl Run {
     /// Prepares the service: nothing moves.
-    async fn prepare(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), String> {
+    async fn prepare(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), ModuleError> {
         work.step("connect").await;
-        let state_node = self.service.control.node(Role::State);
-        let state_node = state_node.ok_or("the manifest has no StateCur")?;
+        let state_node = shake.needed(Role::State, "StateCur")?;
         self.nodes.connect(state_node, self.timing.connect).await?;
         work.step("mode and source").await;
         shake.mode().await?;
@@ -84,7 +90,8 @@ impl Run {
         }
         for parameter in &self.parameters {
             let value = work.parameters().get(&parameter.name);
-            let value = value.ok_or_else(|| format!("{} is missing", parameter.name))?;
+            let missing = || InvalidParameter::missing(&parameter.name, "value");
+            let value = value.ok_or_else(missing)?;
             shake.parameter(parameter, value).await?;
         }
         work.step("start").await;
@@ -92,7 +99,7 @@ impl Run {
     }
 
     /// Resets a service whose last run has ended.
-    async fn make_idle(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), String> {
+    async fn make_idle(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), ModuleError> {
         let state = shake.state().await?;
         let is_at_end = matches!(
             state,
@@ -113,24 +120,24 @@ impl Run {
         }
         match state == StateWord::Known(State::Idle) {
             true => Ok(()),
-            false => Err(format!(
-                "the service {} is {state}, so it cannot be started",
-                self.service.name
-            )),
+            false => Err(ModuleError::NotIdle {
+                service: self.service.name.clone(),
+                state,
+            }),
         }
     }
 
     /// Starts the procedure. A Start that has no effect is withdrawn.
-    async fn start(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), String> {
+    async fn start(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), ModuleError> {
         if work.is_stopped() {
-            return Err("stopped before Start".to_owned());
+            return Err(ModuleError::StoppedBeforeStart);
         }
         let sent = shake.command(Command::Start).await;
         let is_idle = |state| state == StateWord::Known(State::Idle);
         let within = ("Start was written", self.timing.handshake);
         let started = tokio::select! {
             started = shake.until(|state| !is_idle(state), within) => started,
-            () = work.stopped() => Err("stopped before the service left Idle".to_owned()),
+            () = work.stopped() => Err(ModuleError::StoppedInIdle),
         };
         let Err(why) = started else {
             return shake.withdraw().await.or(Ok(()));
@@ -144,18 +151,24 @@ impl Run {
             Err(why) => Err(why),
         };
         match state {
-            Ok(state) if is_idle(state) => Err(format!("{why}; Start was withdrawn")),
+            Ok(state) if is_idle(state) => {
+                let why = Box::new(why);
+                Err(ModuleError::Withdrawn { why })
+            }
             Ok(_) => Ok(()),
             Err(silent) => {
-                let what = format!("{why}; whether the procedure runs is unknown: {silent}");
-                work.unknown(what.clone()).await;
-                Err(what)
+                let error = ModuleError::UnknownStart {
+                    why: Box::new(why),
+                    silent: Box::new(silent),
+                };
+                work.unknown(error.to_string()).await;
+                Err(error)
             }
         }
     }
 
     /// Follows the procedure to its end.
-    async fn follow(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, String> {
+    async fn follow(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, ModuleError> {
         let run_time = match has_run_time(&self.procedure, &self.parameters) {
             true => work.parameters().number(RUN_TIME).unwrap_or_default(),
             false => 0.0,
@@ -169,6 +182,7 @@ impl Run {
         loop {
             let before = Instant::now();
             let state = shake.state().await;
+            let executes = matches!(state, Ok(StateWord::Known(State::Execute)));
             if let Ok(state) = state {
                 answered = Instant::now();
                 if shown != Some(state) {
@@ -179,10 +193,10 @@ impl Run {
             match state {
                 Ok(StateWord::Known(State::Completed)) => return self.results(shake, work).await,
                 Ok(StateWord::Known(end @ (State::Stopped | State::Aborted))) => {
-                    return Err(format!("the service is {end}, and not Completed"));
+                    return Err(ModuleError::NotCompleted { end });
                 }
                 Ok(StateWord::Known(State::Idle)) => {
-                    return Err("the service is Idle again, and was not Completed".to_owned());
+                    return Err(ModuleError::IdleAgain);
                 }
                 Ok(StateWord::Known(State::Execute)) => {
                     if !has_executed {
@@ -195,37 +209,38 @@ impl Run {
                         false => Ok(()),
                     };
                     if let Err(why) = completed {
-                        let end = self.stop(shake, work).await;
-                        return Err(format!("{why}; {end}"));
+                        return Err(self.stop_for(why, shake, work).await);
                     }
                 }
                 Ok(_) => {}
                 Err(why) if answered.elapsed() > self.timing.lost => {
                     let lost = self.timing.lost;
-                    let what = format!("no answer for {lost:?}, so the end is unknown: {why}");
-                    work.unknown(what.clone()).await;
-                    return Err(what);
+                    let why = Box::new(why);
+                    let error = ModuleError::Lost { lost, why };
+                    work.unknown(error.to_string()).await;
+                    return Err(error);
                 }
                 Err(_) => {}
             }
             tokio::select! {
                 biased;
                 () = work.held() => {
-                    let why = match work.is_stopped() {
-                        true => Some(String::new()),
-                        false => self.suspend(shake, work).await.err(),
+                    let suspended = match work.is_stopped() {
+                        true => Ok(Suspended::Stopped),
+                        false => self.suspend(shake, work).await,
                     };
                     // The service does not run on without its skill.
-                    if let Some(why) = why {
-                        let end = self.stop(shake, work).await;
-                        return Err(if why.is_empty() { end } else { format!("{why}; {end}") });
+                    match suspended {
+                        Ok(Suspended::Resumed) => {}
+                        Ok(Suspended::Stopped) => return Err(self.stop(shake, work).await),
+                        Err(why) => return Err(self.stop_for(why, shake, work).await),
                     }
                     // A service that was held executes again.
                     completing = None;
                 }
                 () = sleep(self.timing.poll) => {}
             }
-            if state == Ok(StateWord::Known(State::Execute)) {
+            if executes {
                 executed += before.elapsed();
                 show_progress(work, executed, run_time);
             }
@@ -237,7 +252,7 @@ impl Run {
         &self,
         shake: &Handshake<'_>,
         since: &mut Option<Instant>,
-    ) -> Result<(), String> {
+    ) -> Result<(), ModuleError> {
         match *since {
             None => {
                 *since = Some(Instant::now());
@@ -245,7 +260,7 @@ impl Run {
                 shake.command(Command::Complete).await
             }
             Some(since) if since.elapsed() > self.timing.handshake => {
-                Err("Complete had no effect".to_owned())
+                Err(ModuleError::CompleteIgnored)
             }
             Some(_) => Ok(()),
         }
@@ -254,8 +269,8 @@ impl Run {
     /// Pauses or holds the service, and continues it.
     ///
     /// # Errors
-    /// The service did neither, or the run was stopped meanwhile; then the text is empty.
-    async fn suspend(&self, shake: &Handshake<'_>, work: &Work) -> Result<(), String> {
+    /// The service did neither.
+    async fn suspend(&self, shake: &Handshake<'_>, work: &Work) -> Result<Suspended, ModuleError> {
         let can_pause = shake.allows(Command::Pause).await?;
         let (command, rest, resume) = match can_pause {
             true => (Command::Pause, State::Paused, Command::Resume),
@@ -268,11 +283,11 @@ impl Run {
         let reached = shake.until(is_at_rest, within).await?;
         shake.withdraw().await?;
         if reached == StateWord::Known(State::Completed) {
-            return Ok(());
+            return Ok(Suspended::Resumed);
         }
         work.step(rest.name()).await;
         if work.going().await.is_err() {
-            return Err(String::new());
+            return Ok(Suspended::Stopped);
         }
         shake.allowed(resume).await?;
         shake.command(resume).await?;
@@ -280,11 +295,20 @@ impl Run {
         shake
             .until(|state| state != StateWord::Known(rest), within)
             .await?;
-        shake.withdraw().await
+        shake.withdraw().await?;
+        Ok(Suspended::Resumed)
+    }
+
+    /// Stops the service for a reason.
+    async fn stop_for(&self, why: ModuleError, shake: &Handshake<'_>, work: &Work) -> ModuleError {
+        ModuleError::StoppedFor {
+            why: Box::new(why),
+            end: Box::new(self.stop(shake, work).await),
+        }
     }
 
     /// Stops the service: Stop, or Abort if Stop is not allowed. Returns the reason for the end.
-    async fn stop(&self, shake: &Handshake<'_>, work: &Work) -> String {
+    async fn stop(&self, shake: &Handshake<'_>, work: &Work) -> ModuleError {
         let is_at_end = |state| {
             matches!(
                 state,
@@ -318,13 +342,13 @@ impl Run {
             Ok(state) => {
                 // The end is known; a command that stays in place is removed by the next run.
                 let _removed = shake.withdraw().await;
-                format!("stopped: the service is {state}")
+                ModuleError::Stopped { state }
             }
             Err(why) => {
-                let why = sent.err().unwrap_or(why);
-                let what = format!("{command} is not confirmed, so the end is unknown: {why}");
-                work.unknown(what.clone()).await;
-                what
+                let why = Box::new(sent.err().unwrap_or(why));
+                let error = ModuleError::NotStopped { command, why };
+                work.unknown(error.to_string()).await;
+                error
             }
         }
     }
@@ -352,7 +376,7 @@ impl Run {
         }
     }
 
-    async fn results(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, String> {
+    async fn results(&self, shake: &Handshake<'_>, work: &Work) -> Result<Results, ModuleError> {
         work.progress(1.0);
         // The procedure is done; a command that stays in place is removed by the next run.
         let _removed = shake.withdraw().await;
@@ -363,11 +387,12 @@ impl Run {
             let value = match self.result(node, end).await {
                 Ok(value) => value,
                 Err(why) => {
-                    let name = &output.name;
-                    let what =
-                        format!("the service is Completed, the result {name} is unknown: {why}");
-                    work.unknown(what.clone()).await;
-                    return Err(what);
+                    let error = ModuleError::NoResult {
+                        name: output.name.clone(),
+                        why: Box::new(why),
+                    };
+                    work.unknown(error.to_string()).await;
+                    return Err(error);
                 }
             };
             let value = match (output.kind, value.as_f64()) {
@@ -380,14 +405,14 @@ impl Run {
     }
 
     /// Reads a result. A connection that is lost for a moment comes back.
-    async fn result(&self, node: &mtp::Node, end: Instant) -> Result<Value, String> {
+    async fn result(&self, node: &mtp::Node, end: Instant) -> Result<Value, ModuleError> {
         loop {
             let why = match self.nodes.read(&[node]).await {
                 Ok(read) => match read.into_iter().next().flatten() {
                     Some(value) => return Ok(value),
-                    None => "it has no value".to_owned(),
+                    None => ModuleError::ResultWithoutValue,
                 },
-                Err(why) => why,
+                Err(why) => why.into(),
             };
             if Instant::now() >= end {
                 return Err(why);

@@ -7,10 +7,11 @@ use async_trait::async_trait;
 use mtp::pea::{Pea, PeaFaults, PeaValue};
 use mtp::state::{Command, State};
 use mtp::{Module, Node};
+use plant_opcua::client::ClientError;
 use program::Method;
 use skills::{Outcome, Owner, Skill, Value};
 
-use super::{ModuleNodes, ProcessModule, Settings, Timing};
+use super::{ModuleNodes, NodeError, ProcessModule, Settings, Timing};
 
 /// A module in memory.
 struct Memory {
@@ -47,9 +48,9 @@ impl Memory {
             .collect()
     }
 
-    fn answer(&self) -> Result<(), String> {
+    fn answer(&self) -> Result<(), NodeError> {
         match self.is_silent.load(std::sync::atomic::Ordering::SeqCst) {
-            true => Err("no response".to_owned()),
+            true => Err(ClientError::Lost("no response".to_owned()).into()),
             false => Ok(()),
         }
     }
@@ -57,11 +58,11 @@ impl Memory {
 
 #[async_trait]
 impl ModuleNodes for Memory {
-    async fn connect(&self, _node: &Node, _within: Duration) -> Result<(), String> {
+    async fn connect(&self, _node: &Node, _within: Duration) -> Result<(), NodeError> {
         self.answer()
     }
 
-    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, String> {
+    async fn read(&self, nodes: &[&Node]) -> Result<Vec<Option<Value>>, NodeError> {
         self.answer()?;
         let read = |node: &&Node| {
             let value = self.with(|pea| pea.value(&node.item).cloned())?;
@@ -77,7 +78,7 @@ impl ModuleNodes for Memory {
         Ok(nodes.iter().map(read).collect())
     }
 
-    async fn write(&self, node: &Node, value: Value) -> Result<(), String> {
+    async fn write(&self, node: &Node, value: Value) -> Result<(), NodeError> {
         self.answer()?;
         if let Value::UInt32(word) = value
             && node.id().contains("CommandExt")
@@ -95,10 +96,13 @@ impl ModuleNodes for Memory {
             (_, Value::UInt32(value)) => PeaValue::Word(value),
             (_, Value::Int32(value)) => PeaValue::Integer(value),
             (_, Value::String(value)) => PeaValue::Text(value),
-            (_, other) => return Err(format!("{other} has no type of the module")),
+            (_, value) => {
+                let shape = value.shape();
+                return Err(NodeError::WrongType { value, shape });
+            }
         };
         self.with(|pea| pea.write(&node.item, value))
-            .map_err(|refusal| refusal.to_string())
+            .map_err(|refusal| ClientError::Lost(refusal.to_string()).into())
     }
 }
 

@@ -1,7 +1,7 @@
 //! A client that receives the tool position of a robot.
 
 use super::of_robot;
-use super::rtde::Rtde;
+use super::rtde::{Rtde, RtdeError};
 use super::wire::Value;
 
 /// A client that receives the tool position of a robot.
@@ -12,8 +12,8 @@ impl Follower {
     /// Connects to the robot with RTDE at `host:port`.
     ///
     /// # Errors
-    /// Returns the reason for users if the robot does not answer.
-    pub async fn open(rtde: &str) -> Result<Self, String> {
+    /// The robot does not answer.
+    pub async fn open(rtde: &str) -> Result<Self, RtdeError> {
         Rtde::open(rtde, FOLLOWED, &["actual_TCP_pose"], &[])
             .await
             .map(Self)
@@ -23,10 +23,10 @@ impl Follower {
     ///
     /// # Errors
     /// Fails if the connection is lost, or silent for a second.
-    pub async fn position(&mut self) -> Result<[f64; 6], String> {
+    pub async fn position(&mut self) -> Result<[f64; 6], RtdeError> {
         match self.0.next().await?.as_slice() {
             [Value::Vector(pose)] => Ok(of_robot(*pose)),
-            _ => Err("the robot tells a position of another type".to_owned()),
+            _ => Err(self.0.damaged("a position of another type")),
         }
     }
 }

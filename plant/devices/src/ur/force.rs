@@ -3,7 +3,7 @@
 use std::fmt;
 
 use skills::frame::Frame;
-use skills::{Parameters, Results};
+use skills::{InvalidParameter, Parameters, Results};
 
 use super::pose::of_robot;
 
@@ -24,12 +24,16 @@ impl Guard {
     ///
     /// # Errors
     /// MaxForce has no limit, or not three.
-    pub(super) fn of(parameters: &Parameters) -> Result<Self, String> {
-        let most = parameters.get("MaxForce").and_then(skills::Value::as_f64s);
+    pub(super) fn of(parameters: &Parameters) -> Result<Self, InvalidParameter> {
+        let most = parameters.get(MAX_FORCE).and_then(skills::Value::as_f64s);
         let most: Option<[f64; 3]> = most.and_then(|most| most.try_into().ok());
-        let most = most.ok_or("MaxForce has no three numbers")?;
+        let most = most.ok_or_else(|| InvalidParameter::missing(MAX_FORCE, "three numbers"))?;
         if most.iter().any(|limit| *limit < 0.0) || most.iter().all(|limit| *limit <= 0.0) {
-            return Err("MaxForce needs a limit above 0 N for a direction".to_owned());
+            return Err(InvalidParameter::Unexpected {
+                name: MAX_FORCE.to_owned(),
+                given: Some(most.to_vec().into()),
+                expected: "needs a limit above 0 N for a direction".to_owned(),
+            });
         }
         Ok(Self {
             most,
@@ -71,6 +75,9 @@ impl Guard {
     }
 }
 
+/// The parameter with the limits.
+const MAX_FORCE: &str = "MaxForce";
+
 impl fmt::Display for Guard {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let [x, y, z] = self.greatest;
@@ -87,7 +94,7 @@ mod tests {
 
     use super::*;
 
-    fn guard(most: [f64; 3]) -> Result<Guard, String> {
+    fn guard(most: [f64; 3]) -> Result<Guard, InvalidParameter> {
         let of = skills::model::find("ForceMoveSkillType")
             .unwrap()
             .parameters();

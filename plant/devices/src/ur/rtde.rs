@@ -13,6 +13,75 @@ use crate::modbus::connected;
 /// Time limit for a silent robot, which sends 50 times a second.
 const ANSWER: Duration = Duration::from_secs(1);
 
+/// The failure of a connection.
+#[derive(Debug, thiserror::Error)]
+pub enum RtdeError {
+    /// There is no connection.
+    #[error("{address} cannot be reached: {error}")]
+    Unreachable {
+        /// Host and port.
+        address: String,
+        /// The error of the system.
+        error: io::Error,
+    },
+    /// The robot has another version of the protocol.
+    #[error("{address} does not speak RTDE {}", VERSION)]
+    Version {
+        /// Host and port.
+        address: String,
+    },
+    /// The robot does not have an output, or sends it in an unknown type.
+    #[error("{address} does not tell {}: {}", outputs.join(","), kinds.join(","))]
+    Outputs {
+        /// Host and port.
+        address: String,
+        /// The names of the requested outputs.
+        outputs: Vec<String>,
+        /// The types that the robot names for them.
+        kinds: Vec<String>,
+    },
+    /// The robot does not start to send.
+    #[error("{address} does not begin to tell")]
+    NotStarted {
+        /// Host and port.
+        address: String,
+    },
+    /// Another client writes the inputs.
+    #[error("another client of {address} tells it that already")]
+    InputsTaken {
+        /// Host and port.
+        address: String,
+    },
+    /// The connection is lost.
+    #[error("{address} is lost: {error}")]
+    Lost {
+        /// Host and port.
+        address: String,
+        /// The error of the system.
+        error: io::Error,
+    },
+    /// The robot sends nothing that was requested.
+    #[error("{address} is silent for {:?}", ANSWER)]
+    Silent {
+        /// Host and port.
+        address: String,
+    },
+    /// The robot receives nothing.
+    #[error("{address} takes nothing for {:?}", ANSWER)]
+    Deaf {
+        /// Host and port.
+        address: String,
+    },
+    /// The robot sends data that cannot be read.
+    #[error("what {address} says is damaged: {why}")]
+    Damaged {
+        /// Host and port.
+        address: String,
+        /// The fault in the data.
+        why: String,
+    },
+}
+
 /// A connection with agreed recipes.
 #[derive(Debug)]
 pub(crate) struct Rtde {
@@ -31,9 +100,12 @@ impl Rtde {
         hertz: f64,
         outputs: &[&str],
         inputs: &[&str],
-    ) -> Result<Self, String> {
+    ) -> Result<Self, RtdeError> {
         let stream = connected(address).await;
-        let stream = stream.map_err(|error| format!("{address} cannot be reached: {error}"))?;
+        let stream = stream.map_err(|error| RtdeError::Unreachable {
+            address: address.to_owned(),
+            error,
+        })?;
         let mut rtde = Self {
             stream: BufReader::new(stream),
             address: address.to_owned(),
@@ -49,10 +121,11 @@ impl Rtde {
         hertz: f64,
         outputs: &[&str],
         inputs: &[&str],
-    ) -> Result<(), String> {
+    ) -> Result<(), RtdeError> {
         let spoken = self.ask(Type::Protocol, &VERSION.to_be_bytes()).await?;
         if spoken != [1] {
-            return Err(format!("{} does not speak RTDE {VERSION}", self.address));
+            let address = self.address();
+            return Err(RtdeError::Version { address });
         }
         let mut wanted = hertz.to_be_bytes().to_vec();
         wanted.extend(outputs.join(",").bytes());
@@ -60,13 +133,10 @@ impl Rtde {
         let known: Option<Vec<Kind>> = kinds.iter().map(|kind| Kind::of(kind)).collect();
         let known = known
             .filter(|known| known.len() == outputs.len())
-            .ok_or_else(|| {
-                format!(
-                    "{} does not tell {}: {}",
-                    self.address,
-                    outputs.join(","),
-                    kinds.join(",")
-                )
+            .ok_or_else(|| RtdeError::Outputs {
+                address: self.address(),
+                outputs: outputs.iter().map(|name| (*name).to_owned()).collect(),
+                kinds,
             })?;
         self.outputs = (recipe, known);
         let (recipe, kinds) = self
@@ -78,14 +148,16 @@ impl Rtde {
         self.start().await
     }
 
-    async fn start(&mut self) -> Result<(), String> {
+    async fn start(&mut self) -> Result<(), RtdeError> {
         match self.ask(Type::Start, &[]).await?.as_slice() {
             [1] => Ok(()),
-            _ => Err(format!("{} does not begin to tell", self.address)),
+            _ => Err(RtdeError::NotStarted {
+                address: self.address(),
+            }),
         }
     }
 
-    async fn recipe(&mut self, of: Type, wanted: &[u8]) -> Result<(u8, Vec<String>), String> {
+    async fn recipe(&mut self, of: Type, wanted: &[u8]) -> Result<(u8, Vec<String>), RtdeError> {
         let answer = self.ask(of, wanted).await?;
         let mut rest = answer.as_slice();
         let [recipe] = chunk(&mut rest).ok_or_else(|| self.damaged("a recipe without a number"))?;
@@ -94,13 +166,13 @@ impl Rtde {
     }
 
     /// Sends a request, and returns the next package of that type as its response.
-    async fn ask(&mut self, of: Type, body: &[u8]) -> Result<Vec<u8>, String> {
+    async fn ask(&mut self, of: Type, body: &[u8]) -> Result<Vec<u8>, RtdeError> {
         self.write(of, body).await?;
         self.package(of).await
     }
 
     /// Returns the next values, in the order of the recipe. Not cancel-safe.
-    pub(crate) async fn next(&mut self) -> Result<Vec<Value>, String> {
+    pub(crate) async fn next(&mut self) -> Result<Vec<Value>, RtdeError> {
         let body = self.package(Type::Data).await?;
         let mut rest = body.as_slice();
         let (recipe, kinds) = &self.outputs;
@@ -116,12 +188,10 @@ impl Rtde {
     }
 
     /// Sends the values of the inputs to the robot.
-    pub(crate) async fn tell(&mut self, values: &[Value]) -> Result<(), String> {
+    pub(crate) async fn tell(&mut self, values: &[Value]) -> Result<(), RtdeError> {
         let Some(recipe) = self.inputs else {
-            return Err(format!(
-                "another client of {} tells it that already",
-                self.address
-            ));
+            let address = self.address();
+            return Err(RtdeError::InputsTaken { address });
         };
         let mut body = vec![recipe];
         values.iter().for_each(|value| value.put(&mut body));
@@ -130,7 +200,7 @@ impl Rtde {
 
     /// Returns the next package of a type. A robot that sends only other types counts as silent,
     /// too.
-    async fn package(&mut self, of: Type) -> Result<Vec<u8>, String> {
+    async fn package(&mut self, of: Type) -> Result<Vec<u8>, RtdeError> {
         let wanted = async {
             loop {
                 let (said, body) = next(&mut self.stream).await?;
@@ -144,22 +214,39 @@ impl Rtde {
             Ok(Err(error)) if error.kind() == io::ErrorKind::InvalidData => {
                 Err(self.damaged(&error.to_string()))
             }
-            Ok(Err(error)) => Err(format!("{} is lost: {error}", self.address)),
-            Err(_) => Err(format!("{} is silent for {ANSWER:?}", self.address)),
+            Ok(Err(error)) => Err(self.lost(error)),
+            Err(_) => Err(RtdeError::Silent {
+                address: self.address(),
+            }),
         }
     }
 
-    async fn write(&mut self, of: Type, body: &[u8]) -> Result<(), String> {
-        let lost = |error| format!("{} is lost: {error}", self.address);
-        let bytes = package(of, body).map_err(lost)?;
+    async fn write(&mut self, of: Type, body: &[u8]) -> Result<(), RtdeError> {
+        let bytes = package(of, body).map_err(|error| self.lost(error))?;
         match timeout(ANSWER, self.stream.write_all(&bytes)).await {
-            Ok(written) => written.map_err(lost),
-            Err(_) => Err(format!("{} takes nothing for {ANSWER:?}", self.address)),
+            Ok(written) => written.map_err(|error| self.lost(error)),
+            Err(_) => Err(RtdeError::Deaf {
+                address: self.address(),
+            }),
         }
     }
 
-    fn damaged(&self, why: &str) -> String {
-        format!("what {} says is damaged: {why}", self.address)
+    fn address(&self) -> String {
+        self.address.clone()
+    }
+
+    fn lost(&self, error: io::Error) -> RtdeError {
+        RtdeError::Lost {
+            address: self.address(),
+            error,
+        }
+    }
+
+    pub(super) fn damaged(&self, why: &str) -> RtdeError {
+        RtdeError::Damaged {
+            address: self.address(),
+            why: why.to_owned(),
+        }
     }
 }
 
@@ -188,6 +275,6 @@ mod tests {
                 .unwrap_err()
         };
         let (told, ()) = tokio::join!(asks, talks);
-        assert_eq!(told, format!("{address} is silent for 1s"));
+        assert_eq!(told.to_string(), format!("{address} is silent for 1s"));
     }
 }

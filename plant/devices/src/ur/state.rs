@@ -37,6 +37,27 @@ pub(super) const OUTPUTS: [&str; 10] = [
 /// The inputs of RTDE that runs set.
 pub(super) const INPUTS: [&str; 2] = ["speed_slider_mask", "speed_slider_fraction"];
 
+/// The reason why a robot does not move.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum UnfitRobot {
+    #[error("the robot does not move: it is in a protective stop")]
+    ProtectiveStop,
+    #[error("the robot does not move: a safeguard stops it")]
+    Safeguard,
+    #[error("the robot does not move: its emergency stop is pressed")]
+    EmergencyStop,
+    #[error("the robot does not move: its safety system has a fault")]
+    SafetyFault,
+    #[error("the robot does not move: it is starting")]
+    Starting,
+    #[error("the robot does not move: it is switched off")]
+    Off,
+    #[error("the robot does not move: its brakes are not released")]
+    Braked,
+    #[error("the robot does not move: it is not running")]
+    NotRunning,
+}
+
 impl State {
     /// Returns the state in the values of [`OUTPUTS`]; `None` for values of other types.
     pub(super) fn of(values: &[Value]) -> Option<Self> {
@@ -71,20 +92,22 @@ impl State {
         })
     }
 
-    /// Returns the reason for which the robot cannot move, if any.
-    pub(super) fn fit(&self) -> Result<(), String> {
-        let why = match (self.safety, self.mode) {
+    /// Returns whether the robot can move.
+    ///
+    /// # Errors
+    /// The reason why it cannot.
+    pub(super) fn fit(&self) -> Result<(), UnfitRobot> {
+        Err(match (self.safety, self.mode) {
             (1 | 2, 7) => return Ok(()),
-            (3, _) => "it is in a protective stop",
-            (5, _) => "a safeguard stops it",
-            (6 | 7, _) => "its emergency stop is pressed",
-            (8 | 9, _) => "its safety system has a fault",
-            (_, ..=2) => "it is starting",
-            (_, 3) => "it is switched off",
-            (_, 4 | 5) => "its brakes are not released",
-            _ => "it is not running",
-        };
-        Err(format!("the robot does not move: {why}"))
+            (3, _) => UnfitRobot::ProtectiveStop,
+            (5, _) => UnfitRobot::Safeguard,
+            (6 | 7, _) => UnfitRobot::EmergencyStop,
+            (8 | 9, _) => UnfitRobot::SafetyFault,
+            (_, ..=2) => UnfitRobot::Starting,
+            (_, 3) => UnfitRobot::Off,
+            (_, 4 | 5) => UnfitRobot::Braked,
+            (_, _) => UnfitRobot::NotRunning,
+        })
     }
 }
 

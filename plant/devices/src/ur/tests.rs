@@ -372,7 +372,7 @@ struct Brakes {
 
 #[async_trait]
 impl Driver for Brakes {
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let motion = Motion {
             settings: Arc::clone(&self.settings),
             kind: Kind::Linear,

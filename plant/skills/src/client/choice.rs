@@ -6,6 +6,9 @@ use std::time::Duration;
 use tokio::time::timeout;
 
 use super::find::FoundSkill;
+use super::partner_error::{
+    FailedLocator, LocatorError, NotLocated, PartnerError, Unchosen, UnfitGrasp,
+};
 use super::{Detected, Detector, PeerAccess, SkillClient};
 use crate::choosing::{Attachment, Candidate, Choice, NoChoice, Rank, choose};
 use crate::component::{Partner, WorldObject};
@@ -15,7 +18,7 @@ use crate::parameters::TypeName;
 use crate::runs::Runs as _;
 use crate::shown::Outcome;
 use crate::value::Value;
-use crate::workspace::Workspace;
+use crate::workspace::{OutOfWorkspace, Workspace};
 
 /// The state of a tool changer, as its component shows it.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -59,7 +62,7 @@ pub struct Needs<'a> {
 
 impl SkilledComponent {
     /// Returns the reason why the component cannot do the work, if any.
-    fn reaches(&self, positions: &[[f64; 3]]) -> Result<(), String> {
+    fn reaches(&self, positions: &[[f64; 3]]) -> Result<(), OutOfWorkspace> {
         let workspaces = self.workspaces.iter();
         let mut all = workspaces.map(|of| of.allows_all(positions));
         all.find(Result::is_err).unwrap_or(Ok(()))
@@ -67,14 +70,14 @@ impl SkilledComponent {
 
     fn candidate(
         &self,
-        fits: Result<(), String>,
+        fits: Result<(), OutOfWorkspace>,
         attachment: Attachment,
         prefer: &[String],
     ) -> Candidate<&Self> {
         Candidate {
             of: self,
             name: self.application_uri.clone(),
-            fits,
+            fits: fits.map_err(|why| why.to_string()),
             rank: Rank {
                 attachment,
                 preference: Rank::preference(prefer, &self.application_uri),
@@ -85,7 +88,10 @@ impl SkilledComponent {
 }
 
 /// Chooses among components, and returns the reasons by their ApplicationUris.
-fn chosen(what: &str, candidates: Vec<Candidate<&SkilledComponent>>) -> Result<Chosen, String> {
+fn chosen(
+    what: &'static str,
+    candidates: Vec<Candidate<&SkilledComponent>>,
+) -> Result<Chosen, Unchosen> {
     match choose(candidates) {
         Ok(Choice {
             chosen,
@@ -96,13 +102,14 @@ fn chosen(what: &str, candidates: Vec<Candidate<&SkilledComponent>>) -> Result<C
             reason,
             others: reasons(others),
         }),
-        Err(NoChoice::NoneFits(others)) => {
-            Err(format!("no {what} fits: {}", reasons(others).join("; ")))
-        }
-        Err(NoChoice::Equal(equal)) => Err(format!(
-            "several {what}s are found, give one of {}",
-            list(&equal)
-        )),
+        Err(NoChoice::NoneFits(others)) => Err(Unchosen::NoneFits {
+            candidate: what,
+            reasons: reasons(others),
+        }),
+        Err(NoChoice::Equal(equal)) => Err(Unchosen::Several {
+            candidate: what,
+            list: list(&equal),
+        }),
     }
 }
 
@@ -129,11 +136,6 @@ fn is_same_endpoint(a: &str, b: &str) -> bool {
 }
 
 impl PeerAccess {
-    fn searching(&self) -> Result<&Detector, String> {
-        let detector = self.detector.as_ref();
-        detector.ok_or_else(|| "discovery is not running".to_owned())
-    }
-
     /// Chooses the robot. A given robot counts. Otherwise the robot reaches the positions, and of
     /// several such robots it has a tool at its changer or is the most preferred.
     ///
@@ -143,15 +145,18 @@ impl PeerAccess {
         &self,
         given: Option<&Partner>,
         needs: &Needs<'_>,
-    ) -> Result<Chosen, String> {
-        let wrong = |why: String| format!("MoveSkillControllerEndpoint: {why}");
+    ) -> Result<Chosen, PartnerError> {
+        let wrong = PartnerError::Robot;
         if let Some(partner) = given {
             let endpoint = self.endpoint(partner).await?;
             let known = self.detector.as_ref().map(Detector::all);
             let robots = having(&known.unwrap_or_default(), &[]);
             if let Some(robot) = robots.iter().find(|one| is_at(one, &endpoint)) {
                 let reached = robot.reaches(needs.positions);
-                reached.map_err(|why| wrong(format!("{}: {why}", robot.application_uri)))?;
+                reached.map_err(|why| {
+                    let uri = robot.application_uri.clone();
+                    wrong(Unchosen::OutOfWorkspace { uri, why })
+                })?;
             }
             return Ok(Chosen {
                 endpoint,
@@ -159,15 +164,15 @@ impl PeerAccess {
                 others: Vec::new(),
             });
         }
-        let detector = self.searching().map_err(&wrong)?;
+        let detector = self.detector.as_ref();
+        let detector = detector.ok_or_else(|| wrong(Unchosen::NoDiscovery))?;
         let moves = ["PtpMoveSkillType", "LinearMoveSkillType"];
         let robots = candidates(detector, &moves).await;
         if robots.is_empty() {
-            return Err(wrong(format!(
-                "no robot with {} is found{}",
-                moves.join(" and "),
-                detector.unreadable()
-            )));
+            return Err(wrong(Unchosen::Missing {
+                candidate: format!("robot with {}", moves.join(" and ")),
+                unreadable: detector.unreadable(),
+            }));
         }
         let reached: Vec<_> = robots
             .iter()
@@ -202,10 +207,10 @@ impl PeerAccess {
         given: Option<&Partner>,
         mover: &str,
         prefer: &[String],
-    ) -> Result<ChosenTool, String> {
-        let wrong = |why: String| format!("ToolSkillControllerEndpoint: {why}");
+    ) -> Result<ChosenTool, PartnerError> {
+        let wrong = PartnerError::Tool;
         let Some(detector) = &self.detector else {
-            let partner = given.ok_or_else(|| wrong("discovery is not running".to_owned()))?;
+            let partner = given.ok_or_else(|| wrong(Unchosen::NoDiscovery))?;
             return Ok(ChosenTool {
                 endpoint: self.endpoint(partner).await?,
                 plate: Frame::IDENTITY,
@@ -219,16 +224,18 @@ impl PeerAccess {
         };
         if let Some((changer, state)) = mounted {
             let Some(current) = &state.current else {
-                return Err(wrong(format!("the tool at {changer} is unknown")));
+                return Err(wrong(Unchosen::UnknownTool { changer }));
             };
             if current.is_empty() {
-                return Err(wrong(format!("no tool is attached to {changer}")));
+                return Err(wrong(Unchosen::NoTool { changer }));
             }
             let attached = self.endpoint(&Partner::Called(current.clone())).await?;
             if let Some(named) = named.filter(|named| !is_same_endpoint(named, &attached)) {
-                return Err(wrong(format!(
-                    "{named} is not attached to {changer}, which has {current}"
-                )));
+                return Err(wrong(Unchosen::OtherTool {
+                    named,
+                    changer,
+                    current: current.clone(),
+                }));
             }
             return Ok(ChosenTool {
                 endpoint: attached,
@@ -250,7 +257,11 @@ impl PeerAccess {
         }
         if grippers.is_empty() {
             let unreadable = detector.unreadable();
-            return Err(wrong(format!("no gripper is found{unreadable}")));
+            let candidate = "gripper".to_owned();
+            return Err(wrong(Unchosen::Missing {
+                candidate,
+                unreadable,
+            }));
         }
         let all = grippers.iter();
         let judged = all.map(|gripper| gripper.candidate(Ok(()), Attachment::None, prefer));
@@ -302,36 +313,44 @@ impl PeerAccess {
 
     /// Finds an object by the skills of other components that locate objects. `ua-mes`, which knows
     /// the graph of the plant, is asked first.
-    pub(super) async fn locate(&self, id: &str) -> Result<WorldObject, String> {
-        let detector = self.searching()?;
+    pub(super) async fn locate(&self, id: &str) -> Result<WorldObject, NotLocated> {
+        let detector = self.detector.as_ref().ok_or(NotLocated::NoDiscovery)?;
         let of = TypeName::own("LocateObjectSkillType");
         let some = detector.one(&of, FOUND_WITHIN, |_| true).await;
-        some.map_err(|_| "no component with a skill that locates objects is found".to_owned())?;
+        some.map_err(|_| NotLocated::NoLocator)?;
         let mut locators = detector.of_type(&of);
         let executes = TypeName::own("ExecuteProcessSkillType");
         let executors = detector.of_type(&executes);
         locators.sort_by_key(|one| !executors.iter().any(|of| of.endpoint == one.endpoint));
-        let mut reasons = Vec::new();
+        let mut failed = Vec::new();
         for locator in locators {
             match self.located(&locator, id).await {
                 Ok(object) => return Ok(object),
-                Err(why) => reasons.push(format!("{}: {why}", name_of(&locator))),
+                Err(why) => failed.push(FailedLocator {
+                    skill: name_of(&locator.skill),
+                    why,
+                }),
             }
         }
-        Err(reasons.join("; "))
+        Err(NotLocated::Failed { failed })
     }
 
-    async fn located(&self, locator: &Detected, id: &str) -> Result<WorldObject, String> {
-        let client = self.connect(&locator.endpoint).await?;
+    async fn located(&self, locator: &Detected, id: &str) -> Result<WorldObject, LocatorError> {
+        let connected = SkillClient::connect(&locator.endpoint, &self.options).await;
+        let client = connected.map_err(|fault| LocatorError::Component {
+            endpoint: locator.endpoint.clone(),
+            fault,
+        })?;
         let handle = client.handle(&locator.skill);
         let given = vec![("ObjectId".to_owned(), Value::from(id))];
         let ran = handle.run(given, LOCATED_WITHIN).await;
         client.close().await;
-        let outcome = ran.map_err(|fault| fault.to_string())?;
-        match outcome.succeeded {
-            true => object_of(&outcome).ok_or_else(|| "the result has no Pose".to_owned()),
-            false => Err(outcome.message),
+        let outcome = ran?;
+        if !outcome.succeeded {
+            let message = outcome.message;
+            return Err(LocatorError::Failed { message });
         }
+        object_of(&outcome).ok_or(LocatorError::NoPose)
     }
 }
 
@@ -362,8 +381,8 @@ fn object_of(outcome: &Outcome) -> Option<WorldObject> {
     })
 }
 
-fn name_of(found: &Detected) -> String {
-    format!("{}.{}", found.skill.component, found.skill.name)
+fn name_of(skill: &FoundSkill) -> String {
+    format!("{}.{}", skill.component, skill.name)
 }
 
 fn is_at(one: &SkilledComponent, place: &str) -> bool {
@@ -428,34 +447,38 @@ fn having(all: &[Detected], types: &[&str]) -> Vec<SkilledComponent> {
         .collect()
 }
 
-/// Opens the grasp skill of a tool that fits a part. Returns it with the reasons against others.
+/// Opens the grasp skill of a tool that fits a part. Returns it with the skills that do not fit.
 pub(super) async fn fitting_grasp(
     client: &SkillClient,
     shape: Option<&PartShape>,
-) -> Result<(FoundSkill, Vec<String>), String> {
+) -> Result<(FoundSkill, Vec<UnfitGrasp>), PartnerError> {
     let of = TypeName::own("GraspSkillType");
+    let endpoint = || client.endpoint().to_owned();
     let found = client.skills_of(&of).await;
-    let found = found.map_err(|fault| format!("{}: {fault}", client.endpoint()))?;
+    let found = found.map_err(|fault| PartnerError::Component {
+        endpoint: endpoint(),
+        fault,
+    })?;
     if found.is_empty() {
-        return Err(format!(
-            "{} has no skill of GraspSkillType",
-            client.endpoint()
-        ));
+        return Err(PartnerError::NoSkill {
+            endpoint: endpoint(),
+            skill_type: "GraspSkillType".to_owned(),
+        });
     }
-    let mut reasons = Vec::new();
+    let mut unfit = Vec::new();
     for skill in found {
         let fits = skill
             .grip_point
             .map_or(Ok(()), |grip| grip.on(shape).map(drop));
         match fits {
-            Ok(()) => return Ok((skill, reasons)),
-            Err(why) => reasons.push(format!(
-                "{}.{} does not fit: {why}",
-                skill.component, skill.name
-            )),
+            Ok(()) => return Ok((skill, unfit)),
+            Err(why) => unfit.push(UnfitGrasp {
+                skill: name_of(&skill),
+                why,
+            }),
         }
     }
-    Err(reasons.join("; "))
+    Err(PartnerError::NoFittingGrasp { unfit })
 }
 
 /// Time limit to find a component.

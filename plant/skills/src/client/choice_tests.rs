@@ -11,6 +11,7 @@ use super::{ClientOptions, Detector, Needs, PeerAccess, Remote, SkillClient, Too
 use crate::component::{Component, Device, DriverFault, DriverSetup, Partner};
 use crate::conformance;
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::DriverError;
 use crate::parameters::TypeName;
 use crate::server::{ComponentServer, ServeSettings};
 use crate::shown::Outcome;
@@ -80,7 +81,7 @@ impl Device for Camera {
 
 #[async_trait]
 impl Driver for Camera {
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         match work.parameters().text("ObjectId") {
             Some("bolt") => Ok(vec![
                 ("Pose".to_owned(), [0.3, 0.3, 0.1, 0.0, 0.0, 0.0].into()),
@@ -88,7 +89,10 @@ impl Driver for Camera {
                 ("Cylinder".to_owned(), vec![0.01, 0.04].into()),
                 ("Mass".to_owned(), 0.01.into()),
             ]),
-            other => Err(format!("no {} is seen", other.unwrap_or_default())),
+            other => {
+                let why = format!("no {} is seen", other.unwrap_or_default());
+                Err(DriverError::reported(why))
+            }
         }
     }
 }
@@ -344,6 +348,7 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
     assert_eq!(chosen.others, others);
 
     let several = choose([0.4, 0.2, 0.1], &[], None).await.unwrap_err();
+    let several = several.to_string();
     assert!(several.contains("several robots are found"), "{several}");
     assert!(!several.contains("urn:test:short"), "{several}");
     let prefer = ["urn:test:short", "urn:test:table"];
@@ -354,9 +359,10 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
     assert!(chosen.others.contains(&less), "{:?}", chosen.others);
 
     let none = choose([1.5, 0.0, 0.1], &prefer, None).await.unwrap_err();
+    let none = none.to_string();
     assert!(none.contains("no robot fits: "), "{none}");
     let named = choose([0.9, 0.0, 0.1], &[], Some("urn:test:short")).await;
-    assert!(named.unwrap_err().contains(too_far));
+    assert!(named.unwrap_err().to_string().contains(too_far));
 
     // The robot itself refuses the target, too.
     let skill = &robots[0].skills()[0];

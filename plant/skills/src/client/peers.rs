@@ -5,7 +5,7 @@ use std::path::Path;
 use plant_opcua::client::SecurityChoice;
 
 use super::remote::FOUND_WITHIN;
-use super::{ClientOptions, Detector, SkillClient};
+use super::{ClientOptions, Detector, PartnerError, SkillClient};
 use crate::component::{Component, Partner, Security};
 use crate::model::SKILL_TYPE;
 use crate::parameters::TypeName;
@@ -59,32 +59,36 @@ impl PeerAccess {
     /// Connects to a server.
     ///
     /// # Errors
-    /// The endpoint and the reason, for users.
-    pub async fn connect(&self, endpoint: &str) -> Result<SkillClient, String> {
+    /// [`PartnerError::Component`].
+    pub async fn connect(&self, endpoint: &str) -> Result<SkillClient, PartnerError> {
         let connected = SkillClient::connect(endpoint, &self.options).await;
-        connected.map_err(|fault| format!("{endpoint}: {fault}"))
+        connected.map_err(|fault| PartnerError::Component {
+            endpoint: endpoint.to_owned(),
+            fault,
+        })
     }
 
     /// Waits for a partner and returns its endpoint.
     ///
     /// # Errors
     /// The partner is not found; with the reasons of the servers that could not be read.
-    pub async fn endpoint(&self, partner: &Partner) -> Result<String, String> {
+    pub async fn endpoint(&self, partner: &Partner) -> Result<String, PartnerError> {
         let (uri, detector) = match (partner, &self.detector) {
             (Partner::At(endpoint), _) => return Ok(endpoint.clone()),
             (Partner::Called(uri), Some(detector)) => (uri, detector),
             (Partner::Called(uri), None) => {
-                return Err(format!("{uri} cannot be found: discovery is not running"));
+                return Err(PartnerError::Undiscoverable { uri: uri.clone() });
             }
         };
         let any = TypeName::own(SKILL_TYPE);
         let found = detector.one(&any, FOUND_WITHIN, |one| one.application_uri == *uri);
         match found.await {
             Ok(found) => Ok(found.endpoint),
-            Err(SkillFault::Unexpected(_)) => {
-                Err(format!("{uri} is not found{}", detector.unreadable()))
-            }
-            Err(fault) => Err(fault.to_string()),
+            Err(SkillFault::Unexpected(_)) => Err(PartnerError::NotFound {
+                uri: uri.clone(),
+                unreadable: detector.unreadable(),
+            }),
+            Err(fault) => Err(fault.into()),
         }
     }
 }

@@ -6,10 +6,11 @@ use std::time::Duration;
 use async_trait::async_trait;
 
 use super::choice::{Chosen, Needs, fitting_grasp};
-use super::{PeerAccess, SkillClient, SkillHandle};
+use super::{PartnerError, PeerAccess, SkillClient, SkillHandle};
 use crate::component::{Partner, Partners, World, WorldObject};
 use crate::composite::{Job, PickAndPlace};
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::{DriverError, InvalidParameter};
 use crate::frame::Frame;
 use crate::parameters::{Parameters, TypeName};
 use crate::runs::COMPOSITE_HALT_TIMEOUT;
@@ -43,22 +44,27 @@ impl Driver for Remote {
         Some(COMPOSITE_HALT_TIMEOUT)
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         numbers(parameters, "PlacePosition")?;
         for name in [TOOL, MOVER] {
             named(parameters, name)?;
         }
         let id = parameters.text("ObjectId").unwrap_or_default();
-        match pick(parameters) {
-            Some(_) => Ok(()),
-            None if id.is_empty() => {
-                Err("ObjectId or PickPosition must be given: neither says what to pick".to_owned())
-            }
-            None if self.peers.detector.is_none() && !self.world.contains_key(id) => Err(format!(
-                "ObjectId `{id}` is not in the world of this component"
-            )),
-            None => Ok(()),
+        if pick(parameters).is_some() {
+            return Ok(());
         }
+        let expected = if id.is_empty() {
+            "or PickPosition must be given: neither says what to pick".to_owned()
+        } else if self.peers.detector.is_none() && !self.world.contains_key(id) {
+            format!("`{id}` is not in the world of this component")
+        } else {
+            return Ok(());
+        };
+        Err(InvalidParameter::Unexpected {
+            name: "ObjectId".to_owned(),
+            given: Some(id.into()),
+            expected,
+        })
     }
 
     fn uses(&self) -> Vec<String> {
@@ -74,10 +80,10 @@ impl Driver for Remote {
         moves.into_iter().chain(grips).collect()
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let found = tokio::select! {
             found = self.find(&work) => found?,
-            () = work.stopped() => return Err("stopped".to_owned()),
+            () = work.stopped() => return Err(DriverError::Stopped),
         };
         let robot = self.peers.connect(&found.mover).await?;
         if found.mover == found.tool {
@@ -92,7 +98,7 @@ impl Driver for Remote {
                 gripper.close().await;
                 done
             }
-            Err(why) => Err(why),
+            Err(why) => Err(why.into()),
         };
         robot.close().await;
         done
@@ -109,7 +115,7 @@ struct Found {
 
 impl Remote {
     /// Finds the object, the robot and the tool. Nothing moves before all of them are found.
-    async fn find(&self, work: &Work) -> Result<Found, String> {
+    async fn find(&self, work: &Work) -> Result<Found, DriverError> {
         let parameters = work.parameters();
         let object = self.object(parameters, work).await?;
         let given = named(parameters, MOVER)?;
@@ -141,7 +147,7 @@ impl Remote {
             place,
             approach: parameters
                 .number("ApproachOffset")
-                .ok_or("ApproachOffset is not a number")?,
+                .ok_or_else(|| InvalidParameter::missing("ApproachOffset", "number"))?,
             shape: object.shape,
         };
         Ok(Found {
@@ -153,7 +159,11 @@ impl Remote {
     }
 
     /// Looks up the object: PickPosition, the table of this component, then other components.
-    async fn object(&self, parameters: &Parameters, work: &Work) -> Result<WorldObject, String> {
+    async fn object(
+        &self,
+        parameters: &Parameters,
+        work: &Work,
+    ) -> Result<WorldObject, PartnerError> {
         let id = parameters.text("ObjectId").unwrap_or_default();
         let known = self.world.get(id).cloned();
         if let Some(pose) = pick(parameters) {
@@ -172,8 +182,9 @@ impl Remote {
             return Ok(object);
         }
         let located = self.peers.locate(id).await;
-        let object = located.map_err(|why| {
-            format!("ObjectId `{id}` is not in the world of this component, and {why}")
+        let object = located.map_err(|why| PartnerError::Object {
+            id: id.to_owned(),
+            why,
         })?;
         work.note(format!("object {id}: located")).await;
         Ok(object)
@@ -185,10 +196,10 @@ impl Remote {
         gripper: &SkillClient,
         found: &Found,
         work: &Work,
-    ) -> Result<Results, String> {
-        let (grasp, reasons) = fitting_grasp(gripper, found.job.shape.as_ref()).await?;
-        for reason in reasons {
-            work.note(reason).await;
+    ) -> Result<Results, DriverError> {
+        let (grasp, unfit) = fitting_grasp(gripper, found.job.shape.as_ref()).await?;
+        for unfit in unfit {
+            work.note(unfit.to_string()).await;
         }
         let grasp = gripper.handle(&grasp);
         let ptp = one(robot, "PtpMoveSkillType").await?;
@@ -197,7 +208,7 @@ impl Remote {
         let apart = robot.endpoint() != gripper.endpoint();
         for first in [Some(&ptp), apart.then_some(&grasp)].into_iter().flatten() {
             let locked = first.lock("pick and place").await;
-            locked.map_err(|fault| fault.to_string())?;
+            locked.map_err(PartnerError::from)?;
         }
         let composite = PickAndPlace {
             ptp: Arc::new(ptp),
@@ -207,10 +218,7 @@ impl Remote {
             plate: found.plate,
             within: self.partners.within,
         };
-        composite
-            .run(&found.job, work)
-            .await
-            .map_err(|broken| broken.to_string())?;
+        composite.run(&found.job, work).await?;
         Ok(Vec::new())
     }
 }
@@ -221,34 +229,41 @@ fn pick(parameters: &Parameters) -> Option<[f64; 6]> {
     pose.iter().any(|number| *number != 0.0).then_some(pose)
 }
 
-fn numbers(parameters: &Parameters, name: &str) -> Result<[f64; 6], String> {
-    parameters
-        .six(name)
-        .ok_or_else(|| format!("{name} has no six numbers"))
+fn numbers(parameters: &Parameters, name: &str) -> Result<[f64; 6], InvalidParameter> {
+    let numbers = parameters.six(name);
+    numbers.ok_or_else(|| InvalidParameter::missing(name, "six numbers"))
 }
 
 /// Returns the component that a parameter names.
-fn named(parameters: &Parameters, name: &str) -> Result<Option<Partner>, String> {
+fn named(parameters: &Parameters, name: &str) -> Result<Option<Partner>, InvalidParameter> {
     match parameters.text(name).unwrap_or_default() {
         "" => Ok(None),
         uri if uri.starts_with("urn:") => Ok(Some(Partner::Called(uri.to_owned()))),
         url if url.starts_with("opc.tcp://") => Ok(Some(Partner::At(url.to_owned()))),
-        other => Err(format!(
-            "{name} is an endpoint, an ApplicationUri or empty, and `{}` was given",
-            crate::parameters::shortened(other)
-        )),
+        other => Err(InvalidParameter::Unexpected {
+            name: name.to_owned(),
+            given: Some(other.into()),
+            expected: format!(
+                "is an endpoint, an ApplicationUri or empty, and `{}` was given",
+                crate::parameters::shortened(other)
+            ),
+        }),
     }
 }
 
 /// Returns the first skill of a type.
-async fn one(client: &SkillClient, of: &str) -> Result<SkillHandle, String> {
+async fn one(client: &SkillClient, of: &str) -> Result<SkillHandle, PartnerError> {
     let found = client
         .skills_of(&TypeName::own(of))
         .await
-        .map_err(|fault| format!("{}: {fault}", client.endpoint()))?;
-    let first = found
-        .first()
-        .ok_or_else(|| format!("{} has no skill of {of}", client.endpoint()))?;
+        .map_err(|fault| PartnerError::Component {
+            endpoint: client.endpoint().to_owned(),
+            fault,
+        })?;
+    let first = found.first().ok_or_else(|| PartnerError::NoSkill {
+        endpoint: client.endpoint().to_owned(),
+        skill_type: of.to_owned(),
+    })?;
     Ok(client.handle(first))
 }
 

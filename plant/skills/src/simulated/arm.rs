@@ -8,6 +8,7 @@ use tokio::time::Instant;
 
 use super::Profile;
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::Parameters;
 use crate::skill::lock;
 
@@ -153,31 +154,27 @@ impl Driver for Motion {
         true
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         let [x, y, z, ..] = parameters
-            .six("TargetPosition")
-            .ok_or("TargetPosition has no six numbers")?;
+            .six(TARGET)
+            .ok_or_else(|| InvalidParameter::missing(TARGET, "six numbers"))?;
         let (far, reach) = (length(&[x, y, z]), self.arm.settings.reach);
         if far > reach {
-            return Err(format!(
-                "TargetPosition is {far:.3} m from the base, and the tool comes {reach} m far"
-            ));
+            return Err(InvalidParameter::OutOfRange {
+                name: TARGET.to_owned(),
+                given: format!("{far:.3} m from the base"),
+                limit: format!("the tool comes {reach} m far"),
+            });
         }
         Ok(())
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let parameters = work.parameters();
-        let missing = |name: &str| format!("{name} is not there");
-        let target = parameters
-            .six("TargetPosition")
-            .ok_or_else(|| missing("TargetPosition"))?;
-        let speed = parameters
-            .number("MaxVelocity")
-            .ok_or_else(|| missing("MaxVelocity"))?;
-        let acceleration = parameters
-            .number("MaxAcceleration")
-            .ok_or_else(|| missing("MaxAcceleration"))?;
+        let target = parameters.six(TARGET);
+        let target = target.ok_or_else(|| InvalidParameter::missing(TARGET, "six numbers"))?;
+        let speed = number(parameters, "MaxVelocity")?;
+        let acceleration = number(parameters, "MaxAcceleration")?;
         let from = self.arm.position();
         let profile = self.profile(from, target, (speed, acceleration));
         let touches = self.touches(parameters);
@@ -256,9 +253,9 @@ impl Motion {
             .unwrap_or_else(|| Profile::new(0.0, speed, acceleration))
     }
 
-    fn stopped(&self) -> String {
+    fn stopped(&self) -> DriverError {
         let [x, y, z, ..] = self.arm.position();
-        format!("stopped at {x:.3}, {y:.3}, {z:.3} m")
+        DriverError::StoppedWith(format!("at {x:.3}, {y:.3}, {z:.3} m"))
     }
 }
 
@@ -273,17 +270,14 @@ impl Driver for Joints {
         true
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         target_joints(parameters).map(drop)
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let target = target_joints(work.parameters())?;
-        let number = |name: &str| {
-            let number = work.parameters().number(name);
-            number.ok_or_else(|| format!("{name} is not there"))
-        };
-        let (speed, acceleration) = (number("MaxJointVelocity")?, number("MaxJointAcceleration")?);
+        let speed = number(work.parameters(), "MaxJointVelocity")?;
+        let acceleration = number(work.parameters(), "MaxJointAcceleration")?;
         let from = *lock(&self.arm.joints);
         let profile = target
             .iter()
@@ -297,7 +291,7 @@ impl Driver for Joints {
             let seconds = profile.seconds() / self.arm.settings.time_scale / f64::from(PIECES);
             work.spend(Duration::from_secs_f64(seconds))
                 .await
-                .map_err(|_| "stopped on the way".to_owned())?;
+                .map_err(|_| DriverError::StoppedWith("on the way".to_owned()))?;
             *lock(&self.arm.joints) = between(
                 from,
                 target,
@@ -309,9 +303,14 @@ impl Driver for Joints {
     }
 }
 
-fn target_joints(parameters: &Parameters) -> Result<[f64; 6], String> {
-    let target = parameters.six("TargetJointPosition");
-    target.ok_or_else(|| "TargetJointPosition has six numbers, one for each joint".to_owned())
+fn target_joints(parameters: &Parameters) -> Result<[f64; 6], InvalidParameter> {
+    let target = parameters.six(JOINT_TARGET);
+    target.ok_or_else(|| InvalidParameter::missing(JOINT_TARGET, "six numbers"))
+}
+
+fn number(parameters: &Parameters, name: &str) -> Result<f64, InvalidParameter> {
+    let number = parameters.number(name);
+    number.ok_or_else(|| InvalidParameter::missing(name, "number"))
 }
 
 fn between(from: [f64; 6], target: [f64; 6], share: f64) -> [f64; 6] {
@@ -328,6 +327,9 @@ fn length(of: &[f64]) -> f64 {
     of.iter().map(|part| part * part).sum::<f64>().sqrt()
 }
 
+/// The parameters with the targets of moves.
+const TARGET: &str = "TargetPosition";
+const JOINT_TARGET: &str = "TargetJointPosition";
 /// Number of pieces of a joint move.
 const PIECES: u8 = 50;
 /// Interval between updates of the position.

@@ -7,6 +7,7 @@ use async_trait::async_trait;
 
 use super::Profile;
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::Parameters;
 use crate::skill::lock;
 
@@ -45,19 +46,22 @@ impl Driver for Navigation {
         true
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         match parameters.text("Frame") {
             Some("map") => Ok(()),
-            frame => Err(format!(
-                "Frame is {}, and only map is known",
-                frame.unwrap_or_default()
-            )),
+            frame => Err(InvalidParameter::OutOfRange {
+                name: "Frame".to_owned(),
+                given: frame.unwrap_or_default().to_owned(),
+                limit: "only map is known".to_owned(),
+            }),
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let goal = work.parameters().numbers("Goal").unwrap_or_default();
-        let goal: [f64; 3] = goal.try_into().map_err(|_| "Goal has no three numbers")?;
+        let goal: [f64; 3] = goal
+            .try_into()
+            .map_err(|_| InvalidParameter::missing("Goal", "three numbers"))?;
         let from = self.base.pose();
         let ([from_x, from_y, from_heading], [to_x, to_y, to_heading]) = (from, goal);
         let [x, y, heading] = [to_x - from_x, to_y - from_y, to_heading - from_heading];
@@ -83,9 +87,9 @@ impl Driver for Navigation {
 }
 
 impl Navigation {
-    fn stopped(&self) -> String {
+    fn stopped(&self) -> DriverError {
         let [x, y, _] = self.base.pose();
-        format!("stopped at {x:.2}, {y:.2} m")
+        DriverError::StoppedWith(format!("at {x:.2}, {y:.2} m"))
     }
 }
 

@@ -6,8 +6,10 @@ use std::time::Duration;
 use async_trait::async_trait;
 
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::{DriverError, InvalidParameter};
 use crate::parameters::Parameters;
 use crate::skill::lock;
+use crate::value::Value;
 
 /// A simulated tool changer. Its drivers share the attached tool.
 #[derive(Debug, Clone, Default)]
@@ -44,6 +46,11 @@ impl Changer {
     }
 }
 
+/// Another tool is attached, with this ApplicationUri.
+#[derive(Debug, thiserror::Error)]
+#[error("{0} is attached")]
+struct ToolAttached(String);
+
 struct Changing {
     changer: Changer,
     change: Change,
@@ -56,20 +63,24 @@ impl Driver for Changing {
         true
     }
 
-    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+    fn check(&self, parameters: &Parameters) -> Result<(), InvalidParameter> {
         let wanted = parameters.text("ToolAppUri");
         if self.change != Change::Detach && wanted.is_none_or(str::is_empty) {
-            return Err("ToolAppUri is empty".to_owned());
+            return Err(InvalidParameter::Unexpected {
+                name: "ToolAppUri".to_owned(),
+                given: wanted.map(Value::from),
+                expected: "is empty".to_owned(),
+            });
         }
         Ok(())
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let wanted = work.parameters().text("ToolAppUri").unwrap_or_default();
         let attached = self.changer.tool();
         let ways: &[&str] = match self.change {
             Change::Attach if !attached.is_empty() && attached != wanted => {
-                return Err(format!("{attached} is attached"));
+                return Err(DriverError::device(ToolAttached(attached)));
             }
             Change::Attach | Change::Change if attached == wanted => &[],
             Change::Change if !attached.is_empty() => &["Detach", "Attach"],
@@ -79,9 +90,10 @@ impl Driver for Changing {
         };
         for (done, way) in (1_u8..).zip(ways) {
             work.step(*way).await;
-            work.spend(self.takes)
-                .await
-                .map_err(|_| format!("stopped while the tool is to {}", way.to_lowercase()))?;
+            work.spend(self.takes).await.map_err(|_| {
+                let what = way.to_lowercase();
+                DriverError::StoppedWith(format!("while the tool is to {what}"))
+            })?;
             let now = if *way == "Attach" { wanted } else { "" };
             now.clone_into(&mut lock(&self.changer.tool));
             work.progress(f32::from(done) / if ways.len() > 1 { 2.0 } else { 1.0 });
@@ -94,7 +106,6 @@ impl Driver for Changing {
 mod tests {
     use super::*;
     use crate::conformance;
-    use crate::value::Value;
 
     const TAKES: Duration = Duration::from_millis(40);
 

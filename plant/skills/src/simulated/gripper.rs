@@ -7,6 +7,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 
 use crate::driver::{Driver, Results, Work};
+use crate::driver_error::{DriverError, InvalidParameter};
 
 /// Settings of a simulated gripper.
 #[derive(Debug, Clone, PartialEq)]
@@ -87,6 +88,11 @@ impl Gripper {
     }
 }
 
+/// The gripper closed without an object.
+#[derive(Debug, thiserror::Error)]
+#[error("nothing is between the fingers")]
+struct NothingGrasped;
+
 /// Opens or closes the gripper.
 #[derive(Debug)]
 struct Motion {
@@ -101,7 +107,7 @@ impl Driver for Motion {
         true
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let (step, holds) = if self.closes {
             ("Close", self.settings.object)
         } else {
@@ -114,7 +120,7 @@ impl Driver for Motion {
             return Ok(Vec::new());
         }
         if !holds {
-            return Err("nothing is between the fingers".to_owned());
+            return Err(DriverError::device(NothingGrasped));
         }
         Ok(vec![("Gripped".to_owned(), true.into())])
     }
@@ -133,11 +139,11 @@ impl Driver for Width {
         true
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         let width = work
             .parameters()
             .number("Width")
-            .ok_or("Width is no number")?;
+            .ok_or_else(|| InvalidParameter::missing("Width", "number"))?;
         work.step("Move").await;
         self.settings.take_time(&work, "move").await?;
         self.holds.store(false, Ordering::SeqCst);
@@ -149,12 +155,13 @@ impl Driver for Width {
 }
 
 impl GripperSettings {
-    async fn take_time(&self, work: &Work, what: &str) -> Result<(), String> {
+    async fn take_time(&self, work: &Work, what: &str) -> Result<(), DriverError> {
         let piece = self.duration.div_f64(self.time_scale * f64::from(PIECES));
         for done in 1..=PIECES {
-            work.spend(piece)
-                .await
-                .map_err(|_| format!("stopped while the fingers {}", what.to_lowercase()))?;
+            work.spend(piece).await.map_err(|_| {
+                let what = what.to_lowercase();
+                DriverError::StoppedWith(format!("while the fingers {what}"))
+            })?;
             work.progress(f32::from(done) / f32::from(PIECES));
         }
         Ok(())

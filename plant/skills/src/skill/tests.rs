@@ -9,6 +9,7 @@ use tokio::sync::Semaphore;
 
 use super::*;
 use crate::driver::{Results, Work};
+use crate::driver_error::DriverError;
 use crate::model;
 use crate::shown::{Told, Transitioned};
 
@@ -67,23 +68,23 @@ impl Driver for Scripted {
         }
     }
 
-    async fn run(&self, work: Work) -> Result<Results, String> {
+    async fn run(&self, work: Work) -> Result<Results, DriverError> {
         self.began.fetch_add(1, Ordering::SeqCst);
         match self.how {
             How::AtOnce => {}
             How::WhenLet => {
                 tokio::select! {
                     permit = self.gate.acquire() => permit.unwrap().forget(),
-                    () = work.stopped() => return Err("stopped".to_owned()),
+                    () = work.stopped() => return Err(DriverError::Stopped),
                 }
             }
             How::Panics => panic!("a wire is loose"),
-            How::Fails => return Err("nothing is there".to_owned()),
+            How::Fails => return Err(DriverError::reported("nothing is there")),
             How::Deaf => std::future::pending().await,
             How::Lost => {
                 work.stopped().await;
                 work.unknown("the robot is lost").await;
-                return Err("the robot is lost".to_owned());
+                return Err(DriverError::reported("the robot is lost"));
             }
             How::Blocks(time) => block(time),
             How::Elsewhere(how) => {
@@ -96,7 +97,7 @@ impl Driver for Scripted {
                     Elsewhere::IsLost => work.unknown("the robot is lost").await,
                 }
                 self.gate.acquire().await.unwrap().forget();
-                return Err("stopped".to_owned());
+                return Err(DriverError::Stopped);
             }
         }
         Ok(vec![("Gripped".to_owned(), true.into())])
