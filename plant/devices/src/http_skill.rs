@@ -4,12 +4,14 @@
 //! A request that was sent and has no usable response may have been executed. Then the state of the
 //! machine is unknown: the `stop` request is sent, and the skill needs a Reset.
 
+mod template;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use serde_json::{Map, Value as Json};
+use serde_json::Value as Json;
 use skills::yaml::{Code, Kind, Node, Reader};
 use skills::{
     Builtin, Driver, DriverError, InvalidParameter, Measured, Parameters, Results, Sensor,
@@ -17,20 +19,9 @@ use skills::{
 };
 use tokio::time::{Instant, sleep, sleep_until};
 
-use crate::http::{Asked, Fault, Host};
+use self::template::{Template, plain};
+use crate::http::Fault;
 use crate::sensors::ticks;
-use crate::tls::{self, Tls};
-
-/// A request of the YAML.
-#[derive(Debug, Clone, PartialEq)]
-struct Template {
-    method: String,
-    host: Host,
-    /// The path, in which `{Name}` is a parameter.
-    path: String,
-    /// The body. A text `{Name}` is the value of a parameter.
-    body: Option<Json>,
-}
 
 /// A value at a JSON pointer (RFC 6901) and the values that it is compared with.
 #[derive(Debug, Clone, PartialEq)]
@@ -172,7 +163,7 @@ impl Driver for HttpSkill {
         let poll = self.poll.as_ref().map(|of| &of.request);
         let all = [Some(&self.start), poll, self.stop.as_ref()];
         for template in all.into_iter().flatten() {
-            template.filled(parameters)?;
+            template.check(parameters)?;
         }
         Ok(())
     }
@@ -322,153 +313,6 @@ async fn at(until: Option<Instant>) {
     }
 }
 
-impl Template {
-    async fn send(&self, parameters: &Parameters, within: Duration) -> Result<Json, Fault> {
-        self.send_unless(parameters, within, || false).await
-    }
-
-    /// Sends the request, unless it is withdrawn before.
-    async fn send_unless(
-        &self,
-        parameters: &Parameters,
-        within: Duration,
-        withdrawn: impl Fn() -> bool + Send,
-    ) -> Result<Json, Fault> {
-        let filled = self.filled(parameters);
-        let (path, body) = filled.map_err(|why| Fault::Unreachable(why.to_string()))?;
-        let asked = Asked {
-            method: &self.method,
-            path: &path,
-            body: body.as_ref(),
-            within,
-        };
-        self.host.ask_unless(asked, withdrawn).await
-    }
-
-    /// Returns the path and the body with the values of parameters.
-    ///
-    /// # Errors
-    /// A parameter that is unknown or does not fit in the path.
-    fn filled(&self, parameters: &Parameters) -> Result<(String, Option<Json>), InvalidParameter> {
-        let value = |name: &str| {
-            let value = parameters.get(name).map(Value::to_json);
-            value.ok_or_else(|| no_parameter(name))
-        };
-        let path = filled_path(&self.path, &value)?;
-        let body = self.body.as_ref().map(|body| filled(body, &value));
-        Ok((path, body.transpose()?))
-    }
-}
-
-fn no_parameter(name: &str) -> InvalidParameter {
-    InvalidParameter::Unexpected {
-        name: name.to_owned(),
-        given: None,
-        expected: "is not a parameter of the skill".to_owned(),
-    }
-}
-
-/// Replaces each `{Name}` of a text.
-fn fill(
-    text: &str,
-    value: &dyn Fn(&str) -> Result<String, InvalidParameter>,
-) -> Result<String, InvalidParameter> {
-    let mut out = String::new();
-    let mut rest = text;
-    while let Some((before, after)) = rest.split_once('{') {
-        out.push_str(before);
-        match after.split_once('}') {
-            Some((name, after)) if is_name(name) => {
-                out.push_str(&value(name)?);
-                rest = after;
-            }
-            _ => {
-                out.push('{');
-                rest = after;
-            }
-        }
-    }
-    out.push_str(rest);
-    Ok(out)
-}
-
-/// Fills a path and its query. Values are escaped: each stays within its segment of the path.
-///
-/// # Errors
-/// A parameter that is unknown, or with which a segment is `.` or `..`: servers replace such
-/// segments.
-fn filled_path(
-    template: &str,
-    value: &dyn Fn(&str) -> Result<Json, InvalidParameter>,
-) -> Result<String, InvalidParameter> {
-    let (path, query) = match template.find('?') {
-        Some(at) => template.split_at(at),
-        None => (template, ""),
-    };
-    let part = |text: &str| fill(text, &|name| Ok(escaped(&plain(&value(name)?))));
-    let segment = |template: &str| {
-        let segment = part(template)?;
-        let name = template.split(['{', '}']).nth(1);
-        match name.filter(|_| matches!(&*segment, "." | "..")) {
-            None => Ok(segment),
-            Some(name) => Err(InvalidParameter::Unexpected {
-                name: name.to_owned(),
-                given: Some(segment.as_str().into()),
-                expected: format!("makes `{segment}` a segment of the path"),
-            }),
-        }
-    };
-    let segments: Vec<String> = path.split('/').map(segment).collect::<Result<_, _>>()?;
-    Ok(segments.join("/") + &part(query)?)
-}
-
-fn filled(
-    json: &Json,
-    value: &dyn Fn(&str) -> Result<Json, InvalidParameter>,
-) -> Result<Json, InvalidParameter> {
-    Ok(match json {
-        Json::String(text) => {
-            let whole = text.strip_prefix('{').and_then(|of| of.strip_suffix('}'));
-            match whole.filter(|name| is_name(name)) {
-                Some(name) => value(name)?,
-                None => fill(text, &|name| Ok(plain(&value(name)?)))?.into(),
-            }
-        }
-        Json::Array(elements) => {
-            let elements = elements.iter().map(|element| filled(element, value));
-            Json::Array(elements.collect::<Result<_, _>>()?)
-        }
-        Json::Object(entries) => {
-            let entries = entries
-                .iter()
-                .map(|(key, json)| Ok((key.clone(), filled(json, value)?)));
-            Json::Object(entries.collect::<Result<Map<_, _>, InvalidParameter>>()?)
-        }
-        Json::Null | Json::Bool(_) | Json::Number(_) => json.clone(),
-    })
-}
-
-fn is_name(text: &str) -> bool {
-    !text.is_empty() && text.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
-}
-
-/// Returns a text without quotes, and other values as JSON.
-fn plain(json: &Json) -> String {
-    json.as_str()
-        .map_or_else(|| json.to_string(), str::to_owned)
-}
-
-/// Escapes the bytes that a part of a path or query must not contain (RFC 3986, 2.3).
-fn escaped(text: &str) -> String {
-    let escape = |byte: u8| match byte {
-        b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
-            char::from(byte).to_string()
-        }
-        _ => format!("%{byte:02X}"),
-    };
-    text.bytes().map(escape).collect()
-}
-
 /// A value that is polled.
 #[derive(Debug)]
 struct HttpValue {
@@ -483,22 +327,14 @@ impl Sensor for HttpValue {
         let mut ticks = ticks(period);
         loop {
             ticks.tick().await;
-            let Template {
-                method, host, path, ..
-            } = &self.request;
-            let asked = Asked {
-                method,
-                path,
-                body: None,
-                within: self.within,
-            };
-            let answer = match host.ask(asked).await {
+            let answer = match self.request.ask(self.within).await {
                 Ok(answer) => answer,
                 Err(fault) => return fault.to_string(),
             };
             match answer.pointer(&self.pointer) {
                 Some(found) => out.put_single_json(found),
                 None => {
+                    let host = self.request.host();
                     let why = format!("the response of {host} has no {}", self.pointer);
                     out.put_single(Err(why));
                 }
@@ -507,7 +343,7 @@ impl Sensor for HttpValue {
     }
 
     fn source(&self) -> String {
-        format!("{}{}", self.request.host, self.request.path)
+        self.request.to_string()
     }
 
     fn within(&self, period: Duration) -> Duration {
@@ -521,10 +357,10 @@ pub(crate) fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Drive
     let [start, poll, results, stop, within, halt_timeout] = reader.map(node, keys)?;
     let start = reader
         .needed(start, "start", node.place)
-        .and_then(|node| read_template(node, "POST", reader));
+        .and_then(|node| Template::read(node, "POST", reader));
     let poll = poll.map(|node| read_poll(node, reader));
     let results = results.map_or_else(|| Some(BTreeMap::new()), |node| read_results(node, reader));
-    let stop = stop.map(|node| read_template(node, "POST", reader));
+    let stop = stop.map(|node| Template::read(node, "POST", reader));
     let within = within.map_or(Some(WITHIN), |node| reader.duration(node));
     let halt_timeout = halt_timeout.map_or(Some(HALT), |node| reader.duration(node));
     Some(Arc::new(HttpSkill {
@@ -540,22 +376,16 @@ pub(crate) fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Arc<dyn Drive
 /// Reads the source `http` of a value.
 pub(crate) fn read_value(node: &Node, reader: &mut Reader<'_>) -> Option<SensorRead> {
     let [url, pointer, within] = reader.map(node, ["url", "pointer", "within"])?;
-    let url = reader
+    let request = reader
         .needed(url, "url", node.place)
-        .and_then(|node| read_url(node, reader));
+        .and_then(|node| Template::read_url(node, "GET", reader));
     let pointer = match pointer {
         Some(node) => read_pointer(node, reader),
         None => Some(String::new()),
     };
     let within = within.map_or(Some(WITHIN), |node| reader.duration(node));
-    let (host, path) = url?;
     let sensor = HttpValue {
-        request: Template {
-            method: "GET".to_owned(),
-            host,
-            path,
-            body: None,
-        },
+        request: request?,
         pointer: pointer?,
         within: within?,
     };
@@ -572,117 +402,22 @@ fn whole<T>(read: Option<Option<T>>) -> Option<Option<T>> {
     }
 }
 
-fn read_template(node: &Node, usual: &str, reader: &mut Reader<'_>) -> Option<Template> {
-    let [method, url, body] = match &node.kind {
-        Kind::Scalar(_) => [None, Some(node), None],
-        Kind::Null | Kind::List(_) | Kind::Map(_) => reader.map(node, ["method", "url", "body"])?,
-    };
-    let method = match method {
-        None => Some(usual.to_owned()),
-        Some(node) => {
-            let text = reader.text(node, "GET, POST, PUT, PATCH or DELETE")?;
-            let known = ["GET", "POST", "PUT", "PATCH", "DELETE"].contains(&text);
-            known.then(|| text.to_owned()).or_else(|| {
-                let message = format!("expected GET, POST, PUT, PATCH or DELETE, found `{text}`");
-                reader.refuse(node, Code::WrongValue, message)
-            })
-        }
-    };
-    let url = reader
-        .needed(url, "url", node.place)
-        .and_then(|node| read_url(node, reader));
-    let (host, path) = url?;
-    Some(Template {
-        method: method?,
-        host,
-        path,
-        body: body.map(to_json),
-    })
-}
-
-/// Reads `http://host[:port]/path`, or the same with `https`.
-fn read_url(node: &Node, reader: &mut Reader<'_>) -> Option<(Host, String)> {
-    let text = reader.text(node, "a URL, as http://10.0.0.9/api/state")?;
-    let wrong = |reader: &mut Reader<'_>| {
-        let message = format!("expected http://host[:port]/path or https://, found `{text}`");
-        reader.refuse(node, Code::WrongValue, message)
-    };
-    let schemes = [("http://", 80, false), ("https://", 443, true)];
-    let known = schemes
-        .iter()
-        .find_map(|(scheme, port, secured)| Some((text.strip_prefix(scheme)?, port, *secured)));
-    let Some((rest, usual_port, is_secured)) = known else {
-        return wrong(reader);
-    };
-    let (host, path) = match rest.find(['/', '?']) {
-        Some(at) => rest.split_at(at),
-        None => (rest, ""),
-    };
-    let (name, address) = match host.rsplit_once(':') {
-        Some((name, port)) if port.parse::<u16>().is_ok_and(|port| port > 0) => {
-            (name, host.to_owned())
-        }
-        Some(_) => return wrong(reader),
-        None => (host, format!("{host}:{usual_port}")),
-    };
-    let clean = |text: &str| {
-        text.bytes()
-            .all(|b| b.is_ascii_graphic() && !b"\"<>\\^`|#".contains(&b))
-    };
-    if host.starts_with(':') || host.is_empty() || host.contains(['@', '{']) || !clean(rest) {
-        return wrong(reader);
-    }
-    let path = match path.starts_with('/') {
-        true => path.to_owned(),
-        false => format!("/{path}"),
-    };
-    if !is_secured {
-        return Some((Host::plain(address), path));
-    }
-    let tls = tls::authorities().and_then(|authorities| Tls::new(name, authorities));
-    match tls {
-        Ok(tls) => Some((Host::secured(address, tls), path)),
-        Err(why) => reader.refuse(node, Code::WrongValue, format!("`{text}`: {why}")),
-    }
-}
-
-/// Converts a tree to JSON. Scalars are numbers and Booleans as far as they are such.
-fn to_json(node: &Node) -> Json {
-    match &node.kind {
-        Kind::Null => Json::Null,
-        Kind::Scalar(text) => match serde_json::from_str(text) {
-            Ok(json @ (Json::Number(_) | Json::Bool(_))) => json,
-            Ok(_) | Err(_) => Json::from(text.as_str()),
-        },
-        Kind::List(nodes) => nodes.iter().map(to_json).collect(),
-        Kind::Map(pairs) => {
-            let entries = pairs.iter().filter_map(|(key, value)| {
-                let Kind::Scalar(key) = &key.kind else {
-                    return None;
-                };
-                Some((key.clone(), to_json(value)))
-            });
-            Json::Object(entries.collect())
-        }
-    }
-}
-
 fn read_poll(node: &Node, reader: &mut Reader<'_>) -> Option<Poll> {
     let keys = [
         "method", "url", "every", "done", "failed", "progress", "step", "reason",
     ];
     let [method, url, every, done, failed, progress, step, reason] = reader.map(node, keys)?;
     let method = match method.map(|node| reader.text(node, "GET or POST")) {
-        None => Some("GET".to_owned()),
-        Some(Some(text @ ("GET" | "POST"))) => Some(text.to_owned()),
+        None => Some("GET"),
+        Some(Some(text @ ("GET" | "POST"))) => Some(text),
         Some(_) => {
             reader.wrong(node, "`method: GET` or `method: POST`");
             None
         }
     };
-    let url = reader
+    let request = reader
         .needed(url, "url", node.place)
-        .and_then(|node| read_url(node, reader));
+        .and_then(|node| Template::read_url(node, method.unwrap_or("GET"), reader));
     let every = every.map_or(Some(POLL), |node| reader.duration(node));
     let done = reader
         .needed(done, "done", node.place)
@@ -691,14 +426,9 @@ fn read_poll(node: &Node, reader: &mut Reader<'_>) -> Option<Poll> {
     let pointers = [progress, step, reason];
     let [progress, step, reason] =
         pointers.map(|node| whole(node.map(|node| read_pointer(node, reader))));
-    let (host, path) = url?;
+    method?;
     Some(Poll {
-        request: Template {
-            method: method?,
-            host,
-            path,
-            body: None,
-        },
+        request: request?,
         every: every?,
         done: done?,
         failed: whole(failed)?,

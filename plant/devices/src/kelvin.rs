@@ -6,6 +6,8 @@
 //! of them.
 
 mod error;
+mod look;
+mod mover;
 pub mod simulator;
 mod volts;
 
@@ -17,16 +19,18 @@ use std::time::Duration;
 use async_trait::async_trait;
 use skills::{
     Builtin, COMPOSITE_HALT_TIMEOUT, Chosen, Device, DeviceValue, Driver, DriverError, DriverFault,
-    InvalidParameter, Measured, Needs, Parameters, PartEnd, Partner, PartnerError, PeerAccess,
-    Results, Runs, SkillClient, SkillFault, ToolState, TypeName, Value, Work, run_part,
+    InvalidParameter, Measured, Needs, Parameters, Partner, PartnerError, PeerAccess, Results,
+    Runs, SkillFault, ToolState, TypeName, Value, Work,
 };
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 
 use self::error::KelvinError;
+use self::look::Look;
+use self::mover::Connected;
 pub use self::volts::{Detector, InvalidVoltage, LEVELS, Reading, volts};
 use crate::line::Line;
-use crate::modbus::{Fault, Modbus};
+use crate::modbus::Modbus;
 use crate::sensors::{ticks, value};
 
 /// The installation of the changer.
@@ -130,6 +134,10 @@ impl Changer {
         }
     }
 
+    fn look(&self) -> Look {
+        Look::new(&self.settings.converter, &self.converter)
+    }
+
     /// Shows a reading to clients; `None` if there is none.
     fn show(&self, reading: Option<Reading>) {
         let current = match reading {
@@ -220,10 +228,7 @@ impl Device for Changer {
 
     async fn measure(&self, period: Duration, out: &Measured) -> String {
         let mut ticks = ticks(period);
-        let mut look = Look {
-            changer: self,
-            detector: Detector::default(),
-        };
+        let mut look = self.look();
         loop {
             ticks.tick().await;
             let volts = match look.volts().await {
@@ -231,7 +236,7 @@ impl Device for Changer {
                 Err(why) => return why.to_string(),
             };
             out.put("Voltage", Ok(volts.into()));
-            let number = match look.detector.feed(volts) {
+            let number = match look.reading(volts) {
                 Ok(Reading::Ready | Reading::NoTool) => Ok(Value::Byte(0)),
                 Ok(Reading::Tool(number)) => Ok(Value::Byte(number)),
                 Ok(between @ Reading::Intermediate) => Err(between.to_string()),
@@ -243,10 +248,7 @@ impl Device for Changer {
 
     async fn tend(&self, peers: &PeerAccess) {
         let measure = async {
-            let mut look = Look {
-                changer: self,
-                detector: Detector::default(),
-            };
+            let mut look = self.look();
             loop {
                 let reading = look.steady().await;
                 self.show(reading.ok());
@@ -354,10 +356,7 @@ impl Driver for Change {
     }
 
     async fn run(&self, work: Work) -> Result<Results, DriverError> {
-        let mut look = Look {
-            changer: &self.changer,
-            detector: Detector::default(),
-        };
+        let mut look = self.changer.look();
         let now = look.steady().await?;
         self.changer.show(Some(now));
         let wanted = match self.what {
@@ -391,7 +390,9 @@ impl Driver for Change {
             (None, _) => None,
         };
         let put = put.as_ref();
-        let mover = self.changer.connected(&work).await?;
+        let changer = &self.changer;
+        let found = |endpoint: &str| changer.change(|state| endpoint.clone_into(&mut state.mover));
+        let mover = Connected::open(&changer.mover, &changer.peers, found, &work).await?;
         let moved = self.moved(&mover, &mut look, (put, wanted), &work).await;
         mover.close().await;
         match moved {
@@ -558,7 +559,7 @@ impl Change {
     async fn moved(
         &self,
         mover: &Connected,
-        look: &mut Look<'_>,
+        look: &mut Look,
         (put, take): (Option<&Tool>, Option<&Tool>),
         work: &Work,
     ) -> Result<(), KelvinError> {
@@ -589,154 +590,6 @@ fn attached_tool(tool: Option<&Tool>) -> Results {
     vec![("Tool".to_owned(), uri.into())]
 }
 
-/// Reads the voltage.
-struct Look<'c> {
-    changer: &'c Changer,
-    detector: Detector,
-}
-
-impl Look<'_> {
-    async fn once(&mut self) -> Result<Reading, KelvinError> {
-        let volts = self.volts().await?;
-        Ok(self.detector.feed(volts)?)
-    }
-
-    /// Returns the voltage at the changer.
-    async fn volts(&self) -> Result<f64, Fault> {
-        let Converter {
-            register,
-            divider: (line, ground),
-            ..
-        } = self.changer.settings.converter;
-        let words = self.changer.converter.input(register, 1).await?;
-        let millivolts = words.first().copied().unwrap_or_default();
-        Ok(f64::from(millivolts) / 1000.0 * (line + ground) / ground)
-    }
-
-    /// Returns the reading of two equal consecutive measurements.
-    async fn steady(&mut self) -> Result<Reading, KelvinError> {
-        let mut last = self.once().await?;
-        for _ in 0..MOST_LOOKS {
-            sleep(POLL).await;
-            let now = self.once().await?;
-            if now == last {
-                return Ok(now);
-            }
-            last = now;
-        }
-        Err(KelvinError::Unsteady)
-    }
-
-    async fn until(&mut self, wanted: Reading, work: &Work) -> Result<(), KelvinError> {
-        let until = Instant::now() + SWITCHED;
-        loop {
-            let now = self.once().await?;
-            if now == wanted || (wanted == Reading::NoTool && now == Reading::Ready) {
-                return Ok(());
-            }
-            if Instant::now() >= until {
-                return Err(KelvinError::NotSwitched);
-            }
-            tokio::select! {
-                () = work.stopped() => return Err(KelvinError::Stopped),
-                () = sleep(POLL) => {}
-            }
-        }
-    }
-}
-
-/// The skills of the robot, and the connection to them.
-struct Connected {
-    ptp: Arc<dyn Runs>,
-    linear: Arc<dyn Runs>,
-    client: Option<SkillClient>,
-}
-
-impl Changer {
-    /// Connects to the robot.
-    async fn connected(&self, work: &Work) -> Result<Connected, KelvinError> {
-        let partner = match &self.mover {
-            Mover::Skills { ptp, linear } => {
-                return Ok(Connected {
-                    ptp: Arc::clone(ptp),
-                    linear: Arc::clone(linear),
-                    client: None,
-                });
-            }
-            Mover::Component(partner) => partner,
-        };
-        let needs = Needs::default();
-        let endpoint = tokio::select! {
-            found = self.peers.robot(partner.as_ref(), &needs) => found?.endpoint,
-            () = work.stopped() => return Err(KelvinError::Stopped),
-        };
-        self.change(|state| state.mover.clone_from(&endpoint));
-        let client = self.peers.connect(&endpoint).await?;
-        match Connected::with(&client).await {
-            Ok((ptp, linear)) => Ok(Connected {
-                ptp,
-                linear,
-                client: Some(client),
-            }),
-            Err(fault) => {
-                client.close().await;
-                Err(PartnerError::Component { endpoint, fault }.into())
-            }
-        }
-    }
-}
-
-impl Connected {
-    async fn with(client: &SkillClient) -> Result<(Arc<dyn Runs>, Arc<dyn Runs>), SkillFault> {
-        let mut both: Vec<Arc<dyn Runs>> = Vec::new();
-        for of in ["PtpMoveSkillType", "LinearMoveSkillType"] {
-            let found = client.skills_of(&TypeName::own(of)).await?;
-            let first = found
-                .first()
-                .ok_or_else(|| SkillFault::Unexpected(format!("it has no {of}")))?;
-            both.push(Arc::new(client.handle(first)));
-        }
-        let both: [Arc<dyn Runs>; 2] = both
-            .try_into()
-            .map_err(|_| SkillFault::Unexpected("it has no moves".to_owned()))?;
-        let [ptp, linear] = both;
-        Ok((ptp, linear))
-    }
-
-    async fn go(&self, ways: &[Way], within: Duration, work: &Work) -> Result<(), KelvinError> {
-        for (step, straight, to) in ways {
-            work.step(*step).await;
-            let skill = if *straight { &self.linear } else { &self.ptp };
-            let parameters = vec![("TargetPosition".to_owned(), Value::from(*to))];
-            let outcome = match run_part(&**skill, parameters, within, work, work.stopped()).await {
-                PartEnd::Ended(outcome) => outcome,
-                PartEnd::Interrupted { halted, .. } => {
-                    return Err(KelvinError::StoppedAt { step, halted });
-                }
-            };
-            let outcome = outcome.map_err(|fault| KelvinError::Skill {
-                step,
-                skill: skill.name(),
-                fault,
-            })?;
-            if !outcome.succeeded {
-                return Err(KelvinError::Failed {
-                    step,
-                    skill: skill.name(),
-                    message: outcome.message,
-                });
-            }
-        }
-        Ok(())
-    }
-
-    async fn close(self) {
-        if let Some(client) = self.client {
-            client.close().await;
-        }
-    }
-}
-
 /// The values of a changer.
 const VALUES: [DeviceValue; 2] = [
     DeviceValue {
@@ -765,7 +618,6 @@ const SHOWN_EVERY: Duration = Duration::from_millis(500);
 /// Time limit for the end of a component that is switched off.
 const OFF_WITHIN: Duration = Duration::from_secs(5);
 const POLL: Duration = Duration::from_millis(100);
-const MOST_LOOKS: u32 = 20;
 const SWITCHED: Duration = Duration::from_secs(10);
 
 #[cfg(test)]

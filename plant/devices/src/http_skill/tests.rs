@@ -16,6 +16,8 @@ use tokio_rustls::TlsAcceptor;
 
 use super::*;
 use crate::Kinds;
+use crate::http::{Asked, Host};
+use crate::tls::Tls;
 
 /// A connection with or without TLS.
 trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
@@ -325,7 +327,7 @@ async fn damaged_results_are_an_unknown_outcome() {
 fn the_parameters_of_the_stop_request_are_checked_too() {
     let stop = driver("{start: \"http://h/x\", stop: \"http://h/{Speed}\"}").unwrap();
     let refused = stop.check(&Parameters::default()).unwrap_err();
-    assert_eq!(refused, no_parameter("Speed"));
+    assert_eq!(refused, template::no_parameter("Speed"));
 }
 
 #[tokio::test]
@@ -376,53 +378,6 @@ async fn a_response_can_be_the_end_of_the_run() {
         .await;
     let expected = "Gripped: the response has no /held; there is no `stop` request";
     assert_eq!(outcome.message, expected);
-}
-
-#[test]
-fn parameters_fill_templates_as_values_as_text_and_escaped_in_a_path() {
-    let value = |name: &str| match name {
-        "Name" => Ok(Json::from("a b/c")),
-        "Force" => Ok(Json::from(2.5)),
-        other => Err(no_parameter(other)),
-    };
-    let body = serde_json::json!({"n": "{Name}", "f": ["{Force}", "{Force} N", "{ x }", 1]});
-    let expected = serde_json::json!({"n": "a b/c", "f": [2.5, "2.5 N", "{ x }", 1]});
-    assert_eq!(filled(&body, &value), Ok(expected));
-    let path = filled_path("/{Name}?f={Force}", &value);
-    assert_eq!(path.unwrap(), "/a%20b%2Fc?f=2.5");
-    assert!(filled(&"{Speed}".into(), &value).is_err());
-}
-
-#[test]
-fn a_parameter_does_not_leave_its_segment_of_a_path() {
-    let path = |template: &str, name: &str| {
-        let value = |_: &str| Ok(Json::from(name));
-        filled_path(template, &value)
-    };
-    let start = "/programs/{Name}/start";
-    for (name, expected) in [
-        ("../a?b#c", "/programs/..%2Fa%3Fb%23c/start"),
-        ("..\\a", "/programs/..%5Ca/start"),
-        ("%2e%2e", "/programs/%252e%252e/start"),
-        ("...", "/programs/.../start"),
-        ("a.b", "/programs/a.b/start"),
-    ] {
-        assert_eq!(path(start, name).as_deref(), Ok(expected));
-    }
-    for (template, name) in [(start, "."), (start, ".."), ("/{Name}{Name}?x", ".")] {
-        let refused = path(template, name).unwrap_err();
-        let refused = refused.to_string();
-        assert!(refused.starts_with("Name makes `."), "{refused}");
-    }
-    assert_eq!(
-        path("/a?name={Name}&b", "..").as_deref(),
-        Ok("/a?name=..&b")
-    );
-    assert_eq!(
-        path("/a?name={Name}&b", "/?&=").as_deref(),
-        Ok("/a?name=%2F%3F%26%3D&b")
-    );
-    assert_eq!(path("/{x y}/b", "a").as_deref(), Ok("/{x y}/b"));
 }
 
 #[test]
