@@ -156,6 +156,26 @@ fn the_shell_knows_no_ros_library() {
 }
 
 #[test]
+fn what_every_program_needs_knows_no_space() {
+    let space = [
+        "uadp",
+        "messages",
+        "mappings",
+        "bridge-*",
+        "tcpros",
+        "transport",
+        "rustdds",
+        "async-opcua*",
+        "plant-opcua",
+    ];
+    does_not_reach("service", &space);
+    for package in ["discovery", "ua-gds", "ua-station"] {
+        let space = ["mappings", "bridge-*", "tcpros", "transport", "rustdds"];
+        does_not_reach(package, &space);
+    }
+}
+
+#[test]
 fn each_bridge_knows_its_own_ros_library_only() {
     does_not_reach(
         "bridge-ros1",

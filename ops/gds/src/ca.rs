@@ -5,8 +5,8 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind};
 use plant_opcua::own::day;
+use service::{Failure, FailureKind};
 use trust::{Certificate, Request, Serial};
 
 use crate::Folders;
@@ -159,7 +159,7 @@ fn read_request(file: &Path) -> Result<Request, Failure> {
 }
 
 fn read(file: &Path) -> Result<Vec<u8>, Failure> {
-    bridge_node::read_bounded(file, LARGEST).map_err(|why| {
+    documents::read_bounded(file, LARGEST).map_err(|why| {
         let message = format!("{}: {why}", file.display());
         Failure::new(FailureKind::Io, message)
     })
@@ -243,7 +243,7 @@ fn as_json(one: &Issued) -> String {
         "until": day(certificate.validity().1),
         "revoked": one.revoked.map(day),
     });
-    bridge_node::harmless_json(&json.to_string())
+    documents::harmless_json(&json.to_string())
 }
 
 fn of_days(days: u32) -> Duration {

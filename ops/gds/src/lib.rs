@@ -25,7 +25,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service};
+use ::service::{Failure, FailureKind, LogFormat, Service, run_service};
 use discovery::Interface;
 use plant_opcua::pki::default_root;
 use plant_opcua::server::EndpointUrl;

@@ -5,13 +5,13 @@ use std::io::{self, Write as _};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind};
 use opcua::crypto::random;
 use plant_opcua::enrolment::Invitation;
 use plant_opcua::own;
 use plant_opcua::server::EndpointUrl;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use service::{Failure, FailureKind};
 
 use crate::Folders;
 use crate::ca::{io_fault, open, say};
@@ -142,7 +142,7 @@ fn list(folders: &Folders, json: bool) -> Result<(), Failure> {
                 "until": until,
                 "used_by": used,
             });
-            bridge_node::harmless_json(&json.to_string())
+            documents::harmless_json(&json.to_string())
         } else {
             format!(
                 "invitation {} {} for {:?} until {until}",
@@ -223,7 +223,7 @@ fn as_json(one: &SigningRequest) -> String {
         "hosts": request.as_ref().map(|request| request.hosts().to_vec()),
         "key": one.key,
     });
-    bridge_node::harmless_json(&json.to_string())
+    documents::harmless_json(&json.to_string())
 }
 
 const fn state(one: &SigningRequest) -> &'static str {

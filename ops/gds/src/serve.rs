@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind};
+use ::service::{Failure, FailureKind};
 use discovery::{AnnounceSettings, Announced, Interface, announce};
 use log_limit::LogLimit;
 use opcua::sync::Mutex;
@@ -54,7 +54,7 @@ pub(crate) async fn serve(
     let _claimed = claim(&settings.authority).map_err(|fault| of_store(&fault))?;
     let server = Serving::start(&settings, store)?;
     let told = server.tell(&settings)?;
-    bridge_node::ready();
+    ::service::service_manager::ready();
     let mut look = interval(LOOK);
     look.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut warned = None;
@@ -156,7 +156,7 @@ impl Serving {
         let now = now();
         let store = self.gds.store.lock();
         match renew_own(&store, &settings.pki, &settings.endpoint, now) {
-            Ok(true) => bridge_node::restart(),
+            Ok(true) => ::service::restart::restart(),
             Ok(false) => {}
             Err(fault) => {
                 if let Some(suppressed) = self.gds.another("own certificate") {

@@ -6,7 +6,6 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
 use discovery::lds::LdsSettings;
 use discovery::{DEFAULT_LDS, Interface, ListingArguments};
 use plant_opcua::client::HostNames;
@@ -16,6 +15,7 @@ use plant_opcua::pki::default_named;
 use plant_opcua::server::EndpointUrl;
 use plant_opcua::users::{Role, Roles};
 use registry::hierarchy::{Choice, Place};
+use service::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
 
 use crate::{StationSettings, Upper};
 

@@ -6,7 +6,6 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind, Requests};
 use discovery::lds::{self, Around, Gated, LdsSettings, LdsStatus, OnLevel};
 use discovery::{
     AnnounceSettings, Announced, Found, Interface, MdnsFault, Server, WatchSettings, Watcher,
@@ -21,6 +20,7 @@ use plant_opcua::supervision::{CONFIGURE, Supervision, configure_takes};
 use plant_opcua::types::{ObjectId, QualifiedName, StatusCode};
 use plant_opcua::users::{Access, Roles};
 use registry::hierarchy::{Change, Choice, Place, Roster};
+use service::{Failure, FailureKind, Requests};
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 use tracing::{info, warn};
@@ -305,7 +305,7 @@ fn enrol(settings: &StationSettings, uri: &str, faces: Option<&Faces>) -> Option
         capabilities: vec!["LDS".to_owned()],
     };
     let enrolment = Enrolment::new(root, applicant, gds);
-    let kept = tokio::spawn(enrolment.keep(bridge_node::restart));
+    let kept = tokio::spawn(enrolment.keep(service::restart::restart));
     Some(Abort(kept.abort_handle()))
 }
 

@@ -5,11 +5,11 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service};
 use discovery::{
     AnnounceSettings, Announced, Found, Interface, Server, WatchSettings, announce, be_there, watch,
 };
 use serde_json::{Value, json};
+use service::{Failure, FailureKind, LogFormat, Service, run_service};
 use tokio::net::TcpListener;
 
 /// Tells of a server that is not one, or watches who is there.

@@ -7,13 +7,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
-use bridge_node::{Failure, FailureKind, Requests};
 use log_limit::LogLimit;
 use opcua::types::ApplicationType;
 use plant_opcua::enrolment::{Applicant, DirectoryClient, Enrolment, Invitation};
 use plant_opcua::own;
 use registry::{Announcement, Asked, Event, Loss, NetworkRecord, Settings, instance_name};
 use serde::Serialize;
+use service::{Failure, FailureKind, Requests};
 use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
 use tokio::task::{JoinSet, spawn_blocking};
@@ -275,7 +275,7 @@ struct LossStatus {
     silent_ms: Option<u64>,
 }
 
-impl bridge_node::Told for LdsStatus {
+impl service::Told for LdsStatus {
     fn json(&self) -> String {
         // Serialization cannot fail: all keys are strings, and all numbers are finite.
         serde_json::to_string(self).unwrap_or_default()
@@ -330,7 +330,7 @@ pub async fn run_around(
     };
     let (mut lds, questions) = Lds::start(&settings, listening).await?;
     lds.around = around;
-    bridge_node::ready();
+    service::service_manager::ready();
     lds.run(questions, &mut pages, stop).await;
     Ok(())
 }
@@ -408,7 +408,7 @@ impl Lds {
         let mut accepting = JoinSet::new();
         accepting.spawn(endpoint::accept(listener, Arc::clone(&shared)));
         if let Some(enrolment) = settings.enrolment(&shared.own) {
-            accepting.spawn(enrolment.keep(bridge_node::restart));
+            accepting.spawn(enrolment.keep(service::restart::restart));
         }
         let listing = settings.listing_task(&shared.own);
         info!(url, interface = %settings.interface, "the discovery server is listening");

@@ -4,9 +4,9 @@ use std::io::ErrorKind;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind};
 use mdns::Url;
 use plant_opcua::patches::OtherHosts;
+use service::{Failure, FailureKind};
 use tokio::net::TcpListener;
 
 use crate::client;

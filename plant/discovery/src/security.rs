@@ -4,13 +4,13 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind};
 use log_limit::LogLimit;
 use opcua::crypto::{CertificateStore, PrivateKey, X509};
 use opcua::sync::Mutex;
 use opcua::types::StatusCode;
 use plant_opcua::judge::{Judge, Refused};
 use plant_opcua::pki::Pki;
+use service::{Failure, FailureKind};
 use tracing::warn;
 use trust::Names;
 use x509_cert::Certificate;

@@ -6,9 +6,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::pki::default_named;
+use service::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
 
 use crate::lds::{self, LdsSettings};
 use crate::listing::ListingArguments;

@@ -14,6 +14,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+pub use documents::read_bounded;
 use mappings::{PathFault, Readers, Surroundings};
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use tracing::warn;
@@ -145,30 +146,13 @@ pub fn read_text(from: impl Read) -> Result<String, String> {
     utf8(text)
 }
 
-/// Reads a file of any kind, such as a pipe, within a bound.
-///
-/// # Errors
-/// Returns the reason for users: the file cannot be read, or it has more than `most` bytes.
-pub fn read_bounded(file: &Path, most: u64) -> Result<Vec<u8>, String> {
-    let mut bytes = Vec::new();
-    File::open(file)
-        .and_then(|opened| opened.take(most.saturating_add(1)).read_to_end(&mut bytes))
-        .map_err(|error| error.to_string())?;
-    if u64::try_from(bytes.len()).is_ok_and(|length| length <= most) {
-        return Ok(bytes);
-    }
-    Err(match most >> 20 {
-        0 => format!("it is larger than {} KiB", most >> 10),
-        mebibytes => format!("it is larger than {mebibytes} MiB"),
-    })
-}
-
 /// Reads a file of text, such as the YAML of a program, within the bound of a mapping.
 ///
 /// # Errors
 /// Returns the reason for users: the file cannot be read, has more than 8 MiB, or is not UTF-8.
 pub fn read_text_file(file: &Path) -> Result<String, String> {
-    utf8(read_bounded(file, MOST_OF_A_MAPPING)?)
+    let bytes = read_bounded(file, MOST_OF_A_MAPPING);
+    utf8(bytes.map_err(|error| error.to_string())?)
 }
 
 fn utf8(bytes: Vec<u8>) -> Result<String, String> {

@@ -4,8 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::FromArgMatches;
-
-use crate::logging::LogFormat;
+use service::LogFormat;
 
 /// Flags take precedence over `UA_*` environment variables, which take precedence over the mapping.
 #[derive(Debug, Clone, clap::Args)]

@@ -13,6 +13,7 @@ use mappings::{
     Broker, BrokerAddress, CarrierMedium, ConfiguredCarrier, EthernetGroup, Mapping, PubSub,
     SpaceId, UdpGroup,
 };
+use service::{Failure, FailureKind};
 use tokio::sync::watch;
 use transport::{
     Capacity, Carrier, CarrierRules, Carriers, Ethernet, EthernetError, EthernetOptions, Judgement,
@@ -20,7 +21,6 @@ use transport::{
 };
 
 use crate::arguments::Arguments;
-use crate::exit::{Failure, FailureKind};
 use crate::mapping_file::Running;
 pub(crate) use drops::rules;
 use routes::LiveRoutes;

@@ -12,19 +12,17 @@ use std::process::ExitCode;
 use std::time::{Duration, SystemTime};
 
 use mappings::{Mapping, SpaceId};
+use service::service_manager::Pulse;
+use service::{Failure, FailureKind, LogFormat, descriptors, logging, restart, service_manager};
 use tokio::signal::unix::SignalKind;
 use tokio::sync::{oneshot, watch};
 use tokio::task::{LocalSet, spawn_blocking, spawn_local};
 use tokio::time::{Instant, interval, sleep};
 use tracing::{Instrument as _, error, info, warn};
 
-use crate::exit::{Failure, FailureKind};
 use crate::host::ProcessHost;
-use crate::logging::{self, LogFormat};
 use crate::mapping_file::{MappingFile, NodeSetReader};
 use crate::program::{Program, carry, open};
-use crate::service_manager::{self, Pulse};
-use crate::{descriptors, restart, service, signals};
 
 /// The programs of a cell that run in one process.
 #[derive(Debug)]
@@ -149,7 +147,7 @@ fn serve(programs: ProgramSet) -> Result<(), Failure> {
 
 /// Starts the threads of the programs, and ends them at the first signal.
 async fn supervise(programs: ProgramSet) -> Result<(), Failure> {
-    let signal = signals::stopped()?;
+    let signal = service::signals::stopped()?;
     let names: Vec<&'static str> = programs.all().map(|program| program.name).collect();
     info!(
         version = build_info::version(),
@@ -314,7 +312,7 @@ async fn keep(
         };
         log_failure(name, &failure, (&next, is_refused));
         host.failed(name, &failure, &next);
-        let mut hangup = signals::listen(SignalKind::hangup())?;
+        let mut hangup = service::signals::listen(SignalKind::hangup())?;
         let again = async {
             if is_refused {
                 changed(mapping.as_deref(), before).await

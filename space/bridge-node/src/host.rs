@@ -4,12 +4,10 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use service::{Ask, Failure, FailureKind, Pages, Site, service_manager};
 use tokio::sync::watch;
 use transport::ProcessHub;
 
-use crate::exit::{Failure, FailureKind};
-use crate::metrics::{Ask, Pages, Site};
-use crate::service_manager;
 use crate::status::Status;
 use crate::tap::Taps;
 
@@ -67,7 +65,7 @@ impl ProcessHost {
         let taps = Arc::<Taps>::default();
         Self {
             hub: ProcessHub::default(),
-            pages: Arc::new(Pages::alone(program, Some(Arc::clone(&taps)))),
+            pages: Arc::new(Pages::alone(program, Some(Arc::clone(&taps) as _))),
             taps,
             programs: None,
         }
@@ -80,7 +78,7 @@ impl ProcessHost {
         let states = ProgramStates(starting.collect());
         Self {
             hub: ProcessHub::default(),
-            pages: Arc::new(Pages::of_cell(programs, Arc::clone(&taps))),
+            pages: Arc::new(Pages::of_cell(programs, Arc::clone(&taps) as _)),
             taps,
             programs: Some(Arc::new(watch::Sender::new(states))),
         }

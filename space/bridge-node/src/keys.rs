@@ -11,12 +11,12 @@ use std::time::{Duration, SystemTime};
 
 use bridge_core::{KeyDelivery, Router};
 use mappings::{KeySource, Mapping, SecurityGroup};
+use service::{Failure, FailureKind};
 use tokio::sync::{mpsc, watch};
 use tracing::{info, warn};
 
 pub use self::fetch::{Fetched, Fetching, KeyRequest, KeyService};
 use crate::clock::now;
-use crate::exit::{Failure, FailureKind};
 
 /// New keys of a group.
 #[derive(Debug)]

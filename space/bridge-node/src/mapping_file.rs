@@ -17,6 +17,7 @@ use mappings::{
 };
 use messages::{Dialect, TextKind, TypeName};
 use serde::Serialize;
+use service::{Failure, FailureKind};
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
@@ -26,7 +27,6 @@ use type_files::{Environment, TypeFiles, TypePaths};
 pub use self::configuration::ConfigurationFile;
 use self::look::{Before, Look, Seen, see};
 use crate::clock::now;
-use crate::exit::{Failure, FailureKind};
 
 /// Reads NodeSet2 files for the check of a mapping.
 pub type NodeSetReader = fn(&[PathBuf]) -> Box<dyn NodeSets>;

@@ -12,6 +12,9 @@ use std::time::Duration;
 use bridge_core::{Application, Local, Owned, Rank, Router, Settings};
 use clap::Parser;
 use mappings::{Mapping, SecurityGroup, SpaceId};
+use service::{
+    Failure, FailureKind, Requests, RunLoops, Site, descriptors, logging, restart, service_manager,
+};
 use tokio::signal::unix::SignalKind;
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
@@ -24,20 +27,13 @@ use crate::awaited::PeerWatch;
 use crate::busy_poll::BusyPoll;
 use crate::carrier;
 use crate::clock::now;
-use crate::descriptors;
-use crate::exit::{Failure, FailureKind};
 use crate::host::ProcessHost;
 use crate::keys::{KeyRing, KeyService};
-use crate::logging;
 use crate::mapping_file::{ConfigurationFile, MappingFile, NodeSetReader, Running};
-use crate::metrics::{self, Requests, RunLoops, Site};
 use crate::observer::Observer;
 use crate::port::Port;
 use crate::redundancy;
-use crate::restart;
 use crate::run::{Fixed, Outbox, Shell, Turn};
-use crate::service;
-use crate::service_manager;
 use crate::signals;
 use crate::status::Status;
 
@@ -257,7 +253,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
     let host = ProcessHost::alone(P::NAME);
     let ended = runtime.block_on(async move {
-        let signal = signals::stopped()?;
+        let signal = service::signals::stopped()?;
         service_manager::start_watchdog();
         carry(&program, file, (&host, signal)).await
     });
@@ -279,12 +275,12 @@ pub(crate) async fn carry<P: Program>(
     let running = file.running().clone();
     let spaces = program.spaces(&running.mapping)?;
     check_redundancy(program, &running.mapping, &spaces)?;
-    let hangup = signals::listen(SignalKind::hangup())?;
+    let hangup = service::signals::listen(SignalKind::hangup())?;
     let (switch, switches) = watch::channel(0);
     let switching = signals::switches(program.rank().is_some(), switch)?;
     let (changed, changes) = watch::channel(running);
     let site = program.site()?;
-    let RunLoops { asks, mut requests } = metrics::loops(spaces.len());
+    let RunLoops { asks, mut requests } = service::loops(spaces.len());
     host.starting(P::NAME, (&asks, site.as_ref()), arguments.flags.metrics)
         .await?;
     let several = spaces.len() > 1;
@@ -297,7 +293,7 @@ pub(crate) async fn carry<P: Program>(
         } else {
             Span::none()
         };
-        let requests = requests.pop().unwrap_or_else(metrics::never);
+        let requests = requests.pop().unwrap_or_else(service::never);
         let changes = (&changes, &switches);
         let shell = prepare(program, changes, (own, several), (requests, host));
         let shell = shell.instrument(span.clone());

@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 
 use bridge_core::Rank;
 use mappings::{Mapping, SpaceId};
+use service::{Failure, FailureKind};
 
 use crate::arguments::Flags;
-use crate::exit::{Failure, FailureKind};
 
 /// The arguments of a bridge that shares its space with other bridges.
 #[derive(Debug, Clone, clap::Args)]

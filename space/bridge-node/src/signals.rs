@@ -1,24 +1,10 @@
-//! The signals that end a program.
+//! The signal that switches over to another program of a redundant set.
 
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use service::Failure;
+use service::signals::listen;
+use tokio::signal::unix::SignalKind;
 use tokio::sync::watch;
 use tracing::warn;
-
-use crate::exit::{Failure, FailureKind};
-
-/// Completes at the first SIGINT or SIGTERM.
-pub(crate) fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
-    let (mut interrupt, mut terminate) = (
-        listen(SignalKind::interrupt())?,
-        listen(SignalKind::terminate())?,
-    );
-    Ok(async move {
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
-    })
-}
 
 /// Counts the requests to switch over (SIGUSR1) and reports the count. Never completes. A program
 /// without a rank ignores the signal, whose default action would end it.
@@ -36,15 +22,5 @@ pub(crate) fn switches(
             }
         }
         std::future::pending().await
-    })
-}
-
-/// Returns a stream of a signal.
-pub(crate) fn listen(kind: SignalKind) -> Result<Signal, Failure> {
-    signal(kind).map_err(|error| {
-        Failure::new(
-            FailureKind::Io,
-            format!("cannot listen for signals: {error}"),
-        )
     })
 }

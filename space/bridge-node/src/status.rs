@@ -10,12 +10,12 @@ use std::time::Duration;
 use bridge_core::{CallCounters, Counters, Delays, Hop, Reason, Router};
 use mappings::{SpaceId, Variable};
 use serde::Serialize;
+use service::Told;
 use uadp::Timestamp;
 
 use self::carriers::CarrierStatus;
 pub(crate) use self::redundancy::RedundancyStatus;
 use crate::mapping_file::About;
-use crate::metrics::Told;
 use crate::port::LinkState;
 
 /// A snapshot of a program's counters and delays.

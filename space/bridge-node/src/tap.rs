@@ -2,6 +2,7 @@
 //! is asked for.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -10,6 +11,9 @@ use bridge_core::{Crossing, Now, Tapped};
 use mappings::{SpaceId, TopicId};
 use serde::Serialize;
 use serde_json::{Value, json};
+use service::{LiveAnswer, LivePage, StatusCode};
+
+use crate::clock;
 
 /// The tapped topics of a program, shared by its run loops and its pages.
 #[derive(Debug, Default)]
@@ -32,7 +36,7 @@ struct Line {
 
 /// A request for the events of a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct TapRequest {
+struct TapRequest {
     topic: TopicId,
     /// The number of the first wanted event.
     from: u64,
@@ -40,9 +44,40 @@ pub(crate) struct TapRequest {
 
 /// The events of a topic, and whether it was not tapped before.
 #[derive(Debug)]
-pub(crate) struct TapAnswer {
-    pub(crate) json: String,
-    pub(crate) is_new: bool,
+struct TapAnswer {
+    json: String,
+    is_new: bool,
+}
+
+impl LivePage for Taps {
+    fn path(&self) -> &'static str {
+        "/tap"
+    }
+
+    /// Returns the events of a tapped topic. Only programs on this host may ask, because the
+    /// details of a drop may have values.
+    fn answer(&self, query: &str, peer: SocketAddr) -> LiveAnswer {
+        if !peer.ip().to_canonical().is_loopback() {
+            let why = "topics are tapped from this host only\n".to_owned();
+            return LiveAnswer::new(StatusCode::FORBIDDEN, why);
+        }
+        let wanted = match TapRequest::parse(query) {
+            Ok(wanted) => wanted,
+            Err(why) => return LiveAnswer::new(StatusCode::BAD_REQUEST, format!("{why}\n")),
+        };
+        match self.events(&wanted, clock::now().monotonic) {
+            // Each run loop records events before the response is sent.
+            Some(answer) => LiveAnswer {
+                status: StatusCode::OK,
+                body: answer.json,
+                wakes: answer.is_new,
+            },
+            None => {
+                let why = "too many topics are tapped\n".to_owned();
+                LiveAnswer::new(StatusCode::TOO_MANY_REQUESTS, why)
+            }
+        }
+    }
 }
 
 impl TapRequest {
@@ -50,7 +85,7 @@ impl TapRequest {
     ///
     /// # Errors
     /// Returns the fault as text.
-    pub(crate) fn parse(query: &str) -> Result<Self, String> {
+    fn parse(query: &str) -> Result<Self, String> {
         let (mut topic, mut from) = (None, 0);
         for pair in query.split('&') {
             match pair.split_once('=') {
@@ -80,7 +115,7 @@ impl Taps {
 
     /// Taps a topic for a while, and returns its events since the last request. `None` if too many
     /// topics are tapped.
-    pub(crate) fn answer(&self, request: &TapRequest, now: Instant) -> Option<TapAnswer> {
+    fn events(&self, request: &TapRequest, now: Instant) -> Option<TapAnswer> {
         let mut topics = self.topics();
         topics.retain(|_, line| line.until > now);
         let is_new = !topics.contains_key(&request.topic);
@@ -242,14 +277,13 @@ mod tests {
     use bridge_core::Reason;
 
     use super::*;
-    use crate::clock;
 
     fn request(query: &str) -> TapRequest {
         TapRequest::parse(query).unwrap()
     }
 
     fn answered(taps: &Taps, request: &TapRequest, now: Instant) -> Value {
-        serde_json::from_str(&taps.answer(request, now).unwrap().json).unwrap()
+        serde_json::from_str(&taps.events(request, now).unwrap().json).unwrap()
     }
 
     #[test]
@@ -270,7 +304,7 @@ mod tests {
         let at = now.monotonic;
         assert!(!taps.is_on());
         let first = request("topic=ua_1_2_10");
-        assert!(taps.answer(&first, at).unwrap().is_new);
+        assert!(taps.events(&first, at).unwrap().is_new);
         assert!(taps.is_on());
         assert_eq!(taps.wanted(at), [first.topic]);
         let tapped = |crossing| Tapped {
@@ -313,10 +347,10 @@ mod tests {
         let (taps, now) = (Taps::default(), clock::now());
         for id in 1..=8 {
             let asked = request(&format!("topic=ua_1_2_{id}"));
-            assert!(taps.answer(&asked, now.monotonic).is_some());
+            assert!(taps.events(&asked, now.monotonic).is_some());
         }
         let more = request("topic=ua_1_2_9");
-        assert!(taps.answer(&more, now.monotonic).is_none());
+        assert!(taps.events(&more, now.monotonic).is_none());
         let topic = request("topic=ua_1_2_1");
         for _ in 0..MOST_EVENTS + 10 {
             let crossing = Crossing::Taken { bytes: 1 };

@@ -93,8 +93,8 @@ impl ModelSource {
 }
 
 fn read(file: &str) -> Result<String, Failure> {
-    let unreadable = |why: String| Failure::Io(format!("cannot read {file}: {why}"));
-    let bytes = read_bounded(file.as_ref(), MOST_BYTES).map_err(unreadable)?;
+    let bytes = read_bounded(file.as_ref(), MOST_BYTES)
+        .map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))?;
     String::from_utf8(bytes).map_err(|_| Failure::Data(format!("{file}: it is not UTF-8")))
 }
 

@@ -9,9 +9,8 @@ use std::time::Duration;
 use bridge_core::{KeyDelivery, policy_of};
 use mappings::{KeySource, SecurityGroup};
 use serde::Deserialize;
+use service::{Failure, FailureKind};
 use uadp::{Keys, SecurityPolicy};
-
-use crate::exit::{Failure, FailureKind};
 
 /// One key of a SecurityGroup, in its parts; keys and nonce are hexadecimal text.
 #[derive(Deserialize)]

@@ -97,7 +97,7 @@ impl Program for Writer {
     const NAME: &'static str = "ua-space write";
     const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
     const CLAIMS: bool = true;
-    const QUIET: &'static str = "bridge_node=warn,bridge_core=warn";
+    const QUIET: &'static str = "bridge_node=warn,bridge_core=warn,service=warn";
     const NODESETS: Option<NodeSetReader> = Some(plant_nodesets::read);
 
     fn arguments(&self) -> &Arguments {

@@ -25,11 +25,10 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
 use tracing::{debug, info};
 
-pub(crate) use self::parts::{Ask, RunLoops, loops};
+pub use self::parts::{Ask, RunLoops, loops};
 use self::parts::{PageAnswers, PageParts, ShownPart};
-use crate::clock;
+use crate::clock::fault_of_host;
 use crate::exit::{Failure, FailureKind};
-use crate::tap::{TapRequest, Taps};
 
 /// The state of a program at one moment, as the pages show it.
 pub trait Told: Send + 'static {
@@ -72,6 +71,38 @@ pub trait Site: Send + Sync + 'static {
 
     /// Describes the pages at an address, for the log.
     fn describe(&self, at: SocketAddr) -> String;
+}
+
+/// A page with the newest events of the run loops.
+pub trait LivePage: Send + Sync + 'static {
+    /// Returns the path, as `/tap`.
+    fn path(&self) -> &'static str;
+
+    /// Answers a query of a client at an address.
+    fn answer(&self, query: &str, peer: SocketAddr) -> LiveAnswer;
+}
+
+/// The response of a [`LivePage`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LiveAnswer {
+    /// The status code.
+    pub status: StatusCode,
+    /// The body, as text or JSON.
+    pub body: String,
+    /// Whether each run loop is to wake up, and to record events, before the response is sent.
+    pub wakes: bool,
+}
+
+impl LiveAnswer {
+    /// Returns a response that needs no run loop.
+    #[must_use]
+    pub const fn new(status: StatusCode, body: String) -> Self {
+        Self {
+            status,
+            body,
+            wakes: false,
+        }
+    }
 }
 
 /// A stream of a connection, such as a TLS stream.
@@ -121,7 +152,8 @@ pub fn full(bytes: impl Into<Bytes>) -> PageBody {
 pub type Requests<T> = mpsc::Receiver<oneshot::Sender<T>>;
 
 /// Returns a receiver without requests.
-pub(crate) fn never<T>() -> Requests<T> {
+#[must_use]
+pub fn never<T>() -> Requests<T> {
     mpsc::channel(1).1
 }
 
@@ -138,12 +170,12 @@ pub async fn serve_pages<T: Told>(address: Option<SocketAddr>) -> Result<Request
 }
 
 /// The pages of the programs of a process.
-pub(crate) struct Pages<T> {
+pub struct Pages<T> {
     parts: PageParts<T>,
     /// Answers further paths.
     site: Arc<RwLock<Option<Arc<dyn Site>>>>,
-    /// The tapped topics of the run loops.
-    taps: Option<Arc<Taps>>,
+    /// The newest events of the run loops.
+    live: Option<Arc<dyn LivePage>>,
     /// The address of the pages, while they are served.
     at: OnceLock<SocketAddr>,
     /// Whether the pages outlive their programs, which may be started again.
@@ -161,32 +193,34 @@ impl<T> fmt::Debug for Pages<T> {
 
 impl<T: Told> Pages<T> {
     /// Returns the pages of a program that does not run yet. They end with its run loops.
-    pub(crate) fn alone(program: &'static str, taps: Option<Arc<Taps>>) -> Self {
+    #[must_use]
+    pub fn alone(program: &'static str, live: Option<Arc<dyn LivePage>>) -> Self {
         Self {
             parts: PageParts::new(&[program]),
             site: Arc::default(),
-            taps,
+            live,
             at: OnceLock::new(),
             is_cell: false,
         }
     }
 
     /// Returns the pages of programs that do not run yet, and that may be started again.
-    pub(crate) fn of_cell(programs: &[&'static str], taps: Arc<Taps>) -> Self {
+    #[must_use]
+    pub fn of_cell(programs: &[&'static str], live: Arc<dyn LivePage>) -> Self {
         Self {
             parts: PageParts::new(programs),
             is_cell: true,
-            ..Self::alone("", Some(taps))
+            ..Self::alone("", Some(live))
         }
     }
 
     /// Notes that a program runs with these run loops.
-    pub(crate) fn run(&self, program: &str, asks: Vec<Ask<T>>) {
+    pub fn run(&self, program: &str, asks: Vec<Ask<T>>) {
         self.parts.run(program, asks);
     }
 
     /// Notes that a program does not run, for this reason.
-    pub(crate) fn down(&self, program: &str, why: String) {
+    pub fn down(&self, program: &str, why: String) {
         self.parts.down(program, why);
     }
 
@@ -194,7 +228,7 @@ impl<T: Told> Pages<T> {
     ///
     /// # Errors
     /// The address cannot be bound.
-    pub(crate) async fn listen(&self, address: Option<SocketAddr>) -> Result<(), Failure> {
+    pub async fn listen(&self, address: Option<SocketAddr>) -> Result<(), Failure> {
         let Some(address) = address else {
             return Ok(());
         };
@@ -215,7 +249,7 @@ impl<T: Told> Pages<T> {
         let served = Served {
             parts: self.parts.clone(),
             site: Arc::clone(&self.site),
-            taps: self.taps.clone(),
+            live: self.live.clone(),
             is_cell: self.is_cell,
         };
         drop(tokio::spawn(serve_all(listener, served)));
@@ -223,7 +257,7 @@ impl<T: Told> Pages<T> {
     }
 
     /// Lets a site answer further paths, if the pages are served.
-    pub(crate) fn show(&self, site: Arc<dyn Site>) {
+    pub fn show(&self, site: Arc<dyn Site>) {
         let Some(at) = self.at.get() else {
             return;
         };
@@ -281,7 +315,7 @@ type Respond = dyn Fn(Request<Incoming>, Visit) -> BoxFuture<Response<PageBody>>
 struct Served<T> {
     parts: PageParts<T>,
     site: Arc<RwLock<Option<Arc<dyn Site>>>>,
-    taps: Option<Arc<Taps>>,
+    live: Option<Arc<dyn LivePage>>,
     is_cell: bool,
 }
 
@@ -297,7 +331,7 @@ impl<T> Clone for Served<T> {
         Self {
             parts: self.parts.clone(),
             site: Arc::clone(&self.site),
-            taps: self.taps.clone(),
+            live: self.live.clone(),
             is_cell: self.is_cell,
         }
     }
@@ -422,19 +456,13 @@ async fn page<T: Told>(
     visit: Visit,
 ) -> Response<PageBody> {
     let page = match request.uri().path() {
-        "/tap" => {
-            return match &served.taps {
-                Some(taps) => tapped(&request, visit.peer, (&served.parts, taps)).await,
-                None => text(
-                    StatusCode::NOT_FOUND,
-                    "this program passes on no values\n".into(),
-                ),
-            };
-        }
         "/metrics" => Page::Metrics,
         "/status" => Page::Status,
         "/readyz" => Page::Ready,
-        _ => {
+        path => {
+            if let Some(live) = served.live.as_ref().filter(|live| live.path() == path) {
+                return answered(&request, visit.peer, (&served.parts, live)).await;
+            }
             return match served.site() {
                 Some(site) => site.answer(request, visit).await,
                 None => text(
@@ -455,7 +483,7 @@ async fn page<T: Told>(
             shown.iter().map(ShownPart::prometheus).collect::<String>(),
         ),
         Page::Ready => {
-            let clock = clock::fault(clock::now().utc).map(|fault| format!("{fault}\n"));
+            let clock = fault_of_host().map(|fault| format!("{fault}\n"));
             let reasons: String = clock
                 .into_iter()
                 .chain(shown.iter().flat_map(ShownPart::not_ready))
@@ -477,34 +505,17 @@ async fn page<T: Told>(
     }
 }
 
-/// Returns the events of a tapped topic. Only programs on this host may ask, because the details of
-/// a drop may have values.
-async fn tapped<T: Told>(
+/// Returns the answer of a page with the newest events.
+async fn answered<T: Told>(
     request: &Request<Incoming>,
     peer: SocketAddr,
-    (parts, taps): (&PageParts<T>, &Taps),
+    (parts, live): (&PageParts<T>, &Arc<dyn LivePage>),
 ) -> Response<PageBody> {
-    if !peer.ip().to_canonical().is_loopback() {
-        let why = "topics are tapped from this host only\n".to_owned();
-        return text(StatusCode::FORBIDDEN, why);
+    let answer = live.answer(request.uri().query().unwrap_or_default(), peer);
+    if answer.wakes {
+        let _answers = parts.answers().await;
     }
-    let wanted = match TapRequest::parse(request.uri().query().unwrap_or_default()) {
-        Ok(wanted) => wanted,
-        Err(why) => return text(StatusCode::BAD_REQUEST, format!("{why}\n")),
-    };
-    match taps.answer(&wanted, clock::now().monotonic) {
-        Some(answer) => {
-            if answer.is_new {
-                // Each run loop wakes up, and records events before the response is sent.
-                let _answers = parts.answers().await;
-            }
-            text(StatusCode::OK, answer.json)
-        }
-        None => text(
-            StatusCode::TOO_MANY_REQUESTS,
-            "too many topics are tapped\n".into(),
-        ),
-    }
+    text(answer.status, answer.body)
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -537,11 +548,26 @@ mod tests {
     use tokio::net::TcpSocket;
 
     use super::*;
-    use crate::status::Status;
+
+    struct Nothing;
+
+    impl Told for Nothing {
+        fn json(&self) -> String {
+            "{}".to_owned()
+        }
+
+        fn prometheus(&self) -> String {
+            String::new()
+        }
+
+        fn not_ready(&self) -> Vec<String> {
+            Vec::new()
+        }
+    }
 
     /// Serves pages without run loops. Returns the address, and the receiver that keeps the server
     /// running.
-    async fn served() -> (SocketAddr, Requests<Status>) {
+    async fn served() -> (SocketAddr, Requests<Nothing>) {
         let pages = Pages::alone("", None);
         let RunLoops { asks, mut requests } = loops(1);
         pages.run("", asks);

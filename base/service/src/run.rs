@@ -21,7 +21,7 @@ pub trait Service: Parser {
     fn log(&self) -> LogFormat;
 
     /// Runs the program until `stop` completes. A program that serves calls
-    /// [`ready`](crate::ready) as soon as it listens.
+    /// [`ready`](crate::service_manager::ready) as soon as it listens.
     ///
     /// # Errors
     /// The reason why the program cannot run.
@@ -68,10 +68,11 @@ fn serve<S: Service>(service: S) -> Result<(), Failure> {
     ended
 }
 
-/// Parses the command line. Returns the exit code if it asks for help or is invalid.
-pub(crate) fn parse<P: Parser>(
-    arguments: impl IntoIterator<Item = OsString>,
-) -> Result<P, ExitCode> {
+/// Parses the command line.
+///
+/// # Errors
+/// The exit code if the command line asks for help or is invalid. The text is printed.
+pub fn parse<P: Parser>(arguments: impl IntoIterator<Item = OsString>) -> Result<P, ExitCode> {
     P::try_parse_from(arguments).map_err(|usage| {
         // Printing fails if stdout or stderr is closed.
         let _printed = usage.print();

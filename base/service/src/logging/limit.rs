@@ -50,7 +50,7 @@ impl<S: Subscriber> Filter<S> for PerCallsite {
         let throttle = throttles
             .entry(metadata.callsite())
             .or_insert_with(|| Throttle::several(MOST, PERIOD));
-        let admitted = throttle.admit(now().monotonic);
+        let admitted = throttle.admit(now());
         drop(throttles);
         if self.is_counted {
             SUPPRESSED.set(admitted.unwrap_or_default());

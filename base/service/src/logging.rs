@@ -19,7 +19,7 @@ use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{EnvFilter, Layer};
 
 use self::limit::{PerCallsite, take_suppressed};
-use crate::clock;
+use crate::clock::fault_of_host;
 
 /// The format of the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -32,7 +32,7 @@ pub enum LogFormat {
 
 /// Starts logging. `UA_LOG` sets levels, such as `debug` or `info,bridge_core=trace`. `quiet` holds
 /// directives that suppress noisy messages of a library.
-pub(crate) fn start(format: LogFormat, quiet: &str) {
+pub fn start(format: LogFormat, quiet: &str) {
     let levels = std::env::var("UA_LOG").unwrap_or_else(|_| "info".to_owned());
     let filter = EnvFilter::builder().parse_lossy(format!("{quiet},{levels}"));
     let filter = filter.and(PerCallsite::counted());
@@ -56,7 +56,7 @@ pub(crate) fn start(format: LogFormat, quiet: &str) {
     if let Err(error) = started {
         tracing::debug!(%error, "logging was already started");
     }
-    if let Some(fault) = clock::fault(clock::now().utc) {
+    if let Some(fault) = fault_of_host() {
         tracing::warn!("{fault}");
     }
 }
@@ -143,7 +143,8 @@ static SINKS: RwLock<Vec<ListedSink>> = RwLock::new(Vec::new());
 
 /// Returns the span of a program that shares its process with others. Events within the span are
 /// those of the program.
-pub(crate) fn program_span(program: &'static str) -> Span {
+#[must_use]
+pub fn program_span(program: &'static str) -> Span {
     // The level of the least filter, so that each message has its program.
     error_span!(PROGRAM, name = program)
 }
@@ -237,7 +238,14 @@ impl Visit for Text {
 }
 
 /// Prefixes of the crates with forwarded warnings.
-const OURS: [&str; 5] = ["bridge_", "ros2_node", "tcpros", "transport", "uadp"];
+const OURS: [&str; 6] = [
+    "bridge_",
+    "ros2_node",
+    "service",
+    "tcpros",
+    "transport",
+    "uadp",
+];
 
 #[cfg(test)]
 mod tests {

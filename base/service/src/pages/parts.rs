@@ -10,18 +10,19 @@ use tokio::sync::{mpsc, oneshot};
 use super::{Requests, Told};
 
 /// Requests the status of a run loop.
-pub(crate) type Ask<T> = mpsc::Sender<oneshot::Sender<T>>;
+pub type Ask<T> = mpsc::Sender<oneshot::Sender<T>>;
 
 /// The channels between the pages and the run loops of a program.
-pub(crate) struct RunLoops<T> {
+pub struct RunLoops<T> {
     /// The senders, in the order of the spaces.
-    pub(crate) asks: Vec<Ask<T>>,
+    pub asks: Vec<Ask<T>>,
     /// The receivers, the last first: the caller pops them in the order of the spaces.
-    pub(crate) requests: Vec<Requests<T>>,
+    pub requests: Vec<Requests<T>>,
 }
 
 /// Returns the channels of some run loops.
-pub(crate) fn loops<T>(count: usize) -> RunLoops<T> {
+#[must_use]
+pub fn loops<T>(count: usize) -> RunLoops<T> {
     let (asks, mut requests): (Vec<_>, Vec<_>) = (0..count).map(|_| mpsc::channel(4)).unzip();
     requests.reverse();
     RunLoops { asks, requests }

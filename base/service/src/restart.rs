@@ -29,7 +29,8 @@ pub fn restart() {
 }
 
 /// Returns whether the program ends in order to be executed again.
-pub(crate) fn is_requested() -> bool {
+#[must_use]
+pub fn is_requested() -> bool {
     REQUESTED.load(Ordering::Relaxed)
 }
 
@@ -41,7 +42,8 @@ pub fn stop() {
 }
 
 /// Executes the program again after [`restart`]; otherwise returns its exit code.
-pub(crate) fn executed_again(ended: ExitCode) -> ExitCode {
+#[must_use]
+pub fn executed_again(ended: ExitCode) -> ExitCode {
     if !is_requested() {
         return ended;
     }

@@ -5,7 +5,7 @@ use tracing::debug;
 
 /// Raises the limit to at most [`MOST`], as far as the system permits. The usual limit of a shell
 /// is 1024, for programs that use `select`; a graph of 500 topics needs more.
-pub(crate) fn raise() {
+pub fn raise() {
     let limit = getrlimit(Resource::Nofile);
     let most = limit.maximum.map_or(MOST, |maximum| maximum.min(MOST));
     if limit.current.is_none_or(|current| current >= most) {

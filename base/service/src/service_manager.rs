@@ -27,7 +27,7 @@ pub fn ready() {
 
 /// Reports the end of the program, or a restart in the same process, which ends with another
 /// [`ready`].
-pub(crate) fn ending() {
+pub fn ending() {
     if restart::is_requested() {
         send("RELOADING=1")
     } else {
@@ -37,12 +37,12 @@ pub(crate) fn ending() {
 
 /// Sends keep-alives while the runtime makes progress, if the service manager asks for them. A run
 /// loop that hangs stops them, because it uses the only thread.
-pub(crate) fn start_watchdog() {
+pub fn start_watchdog() {
     watch_over(Vec::new());
 }
 
 /// As [`start_watchdog`], while the threads of all pulses make progress, too.
-pub(crate) fn watch_over(mut pulses: Vec<Pulse>) {
+pub fn watch_over(mut pulses: Vec<Pulse>) {
     let variable = |name: &str| env::var_os(name);
     let Some(period) = watchdog_period(variable, process::id()) else {
         return;
@@ -69,7 +69,7 @@ pub(crate) fn watch_over(mut pulses: Vec<Pulse>) {
 
 /// Shows that a thread makes progress.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Pulse {
+pub struct Pulse {
     beats: Arc<AtomicU64>,
     /// The number of beats that were read.
     seen: u64,
@@ -77,7 +77,7 @@ pub(crate) struct Pulse {
 
 impl Pulse {
     /// Beats while the current runtime makes progress, several times between two keep-alives.
-    pub(crate) fn start(&self) {
+    pub fn start(&self) {
         let variable = |name: &str| env::var_os(name);
         let Some(period) = watchdog_period(variable, process::id()) else {
             return;

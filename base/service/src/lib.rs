@@ -1,0 +1,25 @@
+//! What every program needs: exit codes, logging, status pages, signals, the watchdog of the
+//! service manager, and restarts.
+//!
+//! A program of the plant that carries no space implements [`Service`], and its `main` is
+//! [`run_service`]. The programs of the space start with `bridge_node::run`, which uses the same
+//! parts.
+
+mod clock;
+pub mod descriptors;
+mod exit;
+pub mod logging;
+mod pages;
+pub mod restart;
+mod run;
+pub mod service_manager;
+pub mod signals;
+
+pub use exit::{Failure, FailureKind};
+pub use hyper::StatusCode;
+pub use logging::LogFormat;
+pub use pages::{
+    Ask, BoxFuture, LiveAnswer, LivePage, PageBody, Pages, Requests, RunLoops, Secure, Site,
+    Statuses, Stream, Told, Visit, full, loops, never, serve_pages, serve_secure,
+};
+pub use run::{Service, parse, run_service};
