@@ -176,17 +176,8 @@ pub(crate) fn send(
     messages: &[Outgoing<'_>],
 ) -> io::Result<usize> {
     let target = SocketAddrAny::from(target);
-    let bytes = messages.iter().take(AT_ONCE).map(|message| message.bytes);
-    let slices: Vec<[IoSlice<'_>; 1]> = bytes.map(|bytes| [IoSlice::new(bytes)]).collect();
-    let mut controls: Vec<SendAncillaryBuffer<'_, '_, '_>> = slices
-        .iter()
-        .map(|_| SendAncillaryBuffer::default())
-        .collect();
-    let headers = slices.iter().zip(&mut controls);
-    let mut headers: Vec<MMsgHdr<'_>> = headers
-        .map(|(slice, control)| MMsgHdr::new_with_addr(&target, slice, control))
-        .collect();
-    Ok(sendmmsg(socket, &mut headers, SendFlags::DONTWAIT)?)
+    let slices = messages.iter().map(|message| [IoSlice::new(message.bytes)]);
+    send_slices(socket, Some(&target), slices)
 }
 
 /// Sends up to [`AT_ONCE`] messages through a bound socket, each behind the bytes of a header.
@@ -199,17 +190,29 @@ pub(crate) fn send_behind(
     header: &[u8],
     messages: &[Outgoing<'_>],
 ) -> io::Result<usize> {
-    let bytes = messages.iter().take(AT_ONCE).map(|message| message.bytes);
-    let slices: Vec<[IoSlice<'_>; 2]> = bytes
-        .map(|bytes| [IoSlice::new(header), IoSlice::new(bytes)])
-        .collect();
+    let slices = messages
+        .iter()
+        .map(|message| [IoSlice::new(header), IoSlice::new(message.bytes)]);
+    send_slices(socket, None, slices)
+}
+
+/// Sends up to [`AT_ONCE`] messages, each in `N` parts.
+fn send_slices<'m, const N: usize>(
+    socket: impl AsFd,
+    target: Option<&SocketAddrAny>,
+    messages: impl Iterator<Item = [IoSlice<'m>; N]>,
+) -> io::Result<usize> {
+    let slices: Vec<[IoSlice<'_>; N]> = messages.take(AT_ONCE).collect();
     let mut controls: Vec<SendAncillaryBuffer<'_, '_, '_>> = slices
         .iter()
         .map(|_| SendAncillaryBuffer::default())
         .collect();
     let headers = slices.iter().zip(&mut controls);
     let mut headers: Vec<MMsgHdr<'_>> = headers
-        .map(|(slices, control)| MMsgHdr::new(slices, control))
+        .map(|(slices, control)| match target {
+            Some(target) => MMsgHdr::new_with_addr(target, slices, control),
+            None => MMsgHdr::new(slices, control),
+        })
         .collect();
     Ok(sendmmsg(socket, &mut headers, SendFlags::DONTWAIT)?)
 }
