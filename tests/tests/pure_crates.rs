@@ -228,6 +228,7 @@ fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
         "registry",
         "rml",
         "trust",
+        "uri-text",
         "xml-text",
     ] {
         does_not_reach(package, IMPURE);

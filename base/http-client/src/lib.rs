@@ -66,21 +66,6 @@ impl Connection {
     }
 }
 
-/// Percent-encodes a part of a path, or a value of a query.
-#[must_use]
-pub fn encoded(value: &str) -> String {
-    let mut text = String::with_capacity(value.len());
-    for byte in value.bytes() {
-        match byte {
-            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
-                text.push(byte.into());
-            }
-            _ => text.push_str(&format!("%{byte:02X}")),
-        }
-    }
-    text
-}
-
 #[cfg(test)]
 mod tests {
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -120,11 +105,5 @@ mod tests {
         let answer = "HTTP/1.1 200 OK\r\nconnection: close\r\n\r\nno page";
         assert!(matches!(answered(answer, 6).await, Err(HttpError::Body(_))));
         assert!(matches!(answered("", 6).await, Err(HttpError::Exchange(_))));
-    }
-
-    #[test]
-    fn only_unreserved_characters_are_left_as_they_are() {
-        assert_eq!(encoded("urn:a b&c=ü"), "urn%3Aa%20b%26c%3D%C3%BC");
-        assert_eq!(encoded("Opc.Ua_Di-1~"), "Opc.Ua_Di-1~");
     }
 }

@@ -9,13 +9,14 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use http_client::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HeaderValue};
-use http_client::{HttpError, Method, Request, Response, StatusCode, encoded};
+use http_client::{HttpError, Method, Request, Response, StatusCode};
 use hyper::header::InvalidHeaderValue;
 use hyper::http::uri::InvalidUri;
 use serde::Deserialize;
 use serde_json::Value;
 use thiserror::Error;
 use tokio::sync::Semaphore;
+use uri_text::escaped;
 
 use crate::fetch::{FetchFault, StatusUrl};
 use crate::table;
@@ -113,7 +114,7 @@ impl Mes {
 
     /// Returns the plan of a process, with the reason for each choice.
     pub(crate) async fn plan(&self, process: &str) -> Result<Value, MesFault> {
-        let path = format!("/plan/{}", encoded(process));
+        let path = format!("/plan/{}", escaped(process));
         json(&self.send(get(&path)?, LIMIT).await?)
     }
 
@@ -134,9 +135,9 @@ impl Mes {
         parameters: impl Iterator<Item = (&'p String, &'p String)>,
     ) -> Result<Value, MesFault> {
         let given = parameters.filter(|(_, value)| !value.is_empty());
-        let pairs = given.map(|(name, value)| format!("{}={}", encoded(name), encoded(value)));
+        let pairs = given.map(|(name, value)| format!("{}={}", escaped(name), escaped(value)));
         let pairs: Vec<String> = pairs.collect();
-        let path = format!("/ask/{}?{}", encoded(question), pairs.join("&"));
+        let path = format!("/ask/{}?{}", escaped(question), pairs.join("&"));
         self.table(get(&path)?).await
     }
 
@@ -214,7 +215,7 @@ fn upload(
 ) -> Result<Request<Bytes>, MesFault> {
     let mut request = Request::new(file.contents.clone());
     *request.method_mut() = method;
-    let path = format!("/{verb}/{}/{}", file.kind, encoded(&file.name));
+    let path = format!("/{verb}/{}/{}", file.kind, escaped(&file.name));
     *request.uri_mut() = path.parse()?;
     if let Some(Credentials { user, password }) = by {
         let basic = format!("Basic {}", STANDARD.encode(format!("{user}:{password}")));

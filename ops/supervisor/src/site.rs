@@ -20,6 +20,7 @@ use serde::Deserialize;
 use serde_json::{Map, Value, json};
 use subtle::ConstantTimeEq as _;
 use tracing::{info, warn};
+use uri_text::{is_loopback_host, without_port};
 
 use crate::encode;
 use crate::operations::{ConditionChange, OperationFault, Operations};
@@ -407,7 +408,7 @@ impl Page {
             ));
         }
         let is_proxy = self.proxy.as_ref().is_some_and(|proxy| proxy.is_host(host));
-        if is_proxy || is_loopback_name(host) {
+        if is_proxy || is_loopback_host(host) {
             let via = match self.proxy {
                 Some(_) => Via::Proxy,
                 None => Via::Loopback,
@@ -608,23 +609,6 @@ async fn bytes(
             "the request has not arrived",
         )),
     }
-}
-
-/// Returns the name or address in a Host header.
-fn without_port(host: &str) -> &str {
-    let name = match host.rsplit_once(':') {
-        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
-        Some(_) | None => host,
-    };
-    name.trim_start_matches('[').trim_end_matches(']')
-}
-
-fn is_loopback_name(host: &str) -> bool {
-    let name = without_port(host);
-    name == "localhost"
-        || name
-            .parse::<IpAddr>()
-            .is_ok_and(|address| address.is_loopback())
 }
 
 /// Returns a random token in hexadecimal.

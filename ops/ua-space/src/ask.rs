@@ -3,9 +3,9 @@
 use std::fs::File;
 use std::io::{self, Read, Write as _};
 
-use http_client::encoded;
 use serde::Deserialize;
 use serde_json::{Map, Value};
+use uri_text::escaped;
 
 use crate::arguments::Ask;
 use crate::exit::Failure;
@@ -111,13 +111,13 @@ async fn path(server: &Server, question: &str, words: &[String]) -> Result<Strin
     let mut pairs = Vec::new();
     for word in words {
         let pair = match word.split_once('=') {
-            Some((name, value)) if is_named(word) => format!("{name}={}", encoded(value)),
+            Some((name, value)) if is_named(word) => format!("{name}={}", escaped(value)),
             Some(_) | None => {
                 let name = places.next();
                 let name = name.ok_or_else(|| {
                     Failure::Usage(format!("{question} does not take so many values: {word}"))
                 })?;
-                format!("{}={}", encoded(&name), encoded(word))
+                format!("{}={}", escaped(&name), escaped(word))
             }
         };
         pairs.push(pair);
@@ -127,7 +127,7 @@ async fn path(server: &Server, question: &str, words: &[String]) -> Result<Strin
     } else {
         format!("?{}", pairs.join("&"))
     };
-    Ok(format!("/ask/{}{query}", encoded(question)))
+    Ok(format!("/ask/{}{query}", escaped(question)))
 }
 
 async fn questions(server: &Server) -> Result<Questions, Failure> {

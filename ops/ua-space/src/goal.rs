@@ -2,8 +2,8 @@
 
 use std::io::{self, Write as _};
 
-use http_client::encoded;
 use serde::Deserialize;
+use uri_text::escaped;
 
 use crate::arguments::GoalArguments;
 use crate::ask::refusal;
@@ -16,7 +16,7 @@ use crate::survey::look;
 pub(crate) fn goal(arguments: &GoalArguments) -> Result<(), Failure> {
     let server = Server::parse(&arguments.at.mes.url)?;
     look(async {
-        let path = format!("/goal/{}", encoded(&arguments.goal));
+        let path = format!("/goal/{}", escaped(&arguments.goal));
         let answer = server.get(&path).await?;
         if answer.status == 404 {
             return Err(Failure::Usage(format!(

@@ -2,8 +2,8 @@
 
 use std::io::{self, Write as _};
 
-use http_client::encoded;
 use serde::Deserialize;
+use uri_text::escaped;
 
 use crate::arguments::PlanArguments;
 use crate::ask::{parsed, refusal};
@@ -22,7 +22,7 @@ pub(crate) fn plan(arguments: &PlanArguments) -> Result<(), Failure> {
             return list(&known.processes, &status, arguments.json);
         };
         let iri = find(&known.processes, wanted)?;
-        let body = get(&server, &format!("/plan/{}", encoded(iri))).await?;
+        let body = get(&server, &format!("/plan/{}", escaped(iri))).await?;
         show(&body, arguments.json)
     })
 }

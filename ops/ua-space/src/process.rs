@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use http_client::encoded;
 use serde_json::json;
+use uri_text::escaped;
 
 use crate::arguments::{ProcessArguments, ProcessVerb};
 use crate::exit::Failure;
@@ -28,7 +28,7 @@ pub(crate) fn process(arguments: &ProcessArguments) -> Result<(), Failure> {
         None => plain_name(file)?,
     };
     let body = json!({ "recipe": recipe, "names": named(names)? }).to_string();
-    let path = format!("/sources/process/{}", encoded(&name));
+    let path = format!("/sources/process/{}", escaped(&name));
     let done = change("PUT", &path, ("application/json", body.into_bytes()), at)?;
     let verb = match done.status {
         CREATED => "added",

@@ -23,6 +23,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinHandle;
 use tracing::debug;
+use uri_text::{is_loopback_host, unescaped};
 
 use crate::lanes::Lane;
 use crate::query::{Asked, Dataset, Formats, Limits, Queries, QueryFault, Results};
@@ -478,19 +479,6 @@ fn is_local(request: &Request<Incoming>) -> Result<(), Refusal> {
     }
 }
 
-/// Returns whether a host with an optional port is a loopback name.
-pub(crate) fn is_loopback_host(host: &str) -> bool {
-    let name = match host.rsplit_once(':') {
-        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
-        _ => host,
-    };
-    let name = name.trim_start_matches('[').trim_end_matches(']');
-    name == "localhost"
-        || name
-            .parse::<IpAddr>()
-            .is_ok_and(|address| address.is_loopback())
-}
-
 /// Returns the accepted media types in order, without refused types (q=0).
 pub(crate) fn accepted(request: &Request<Incoming>) -> Vec<String> {
     let all = request
@@ -543,28 +531,6 @@ pub(crate) fn form(text: &str) -> Result<Vec<(String, String)>, Refusal> {
     };
     let pairs: Option<Vec<_>> = pairs.iter().map(pair).collect();
     pairs.ok_or_else(|| Refusal::malformed("a parameter is not escaped as %XX of UTF-8"))
-}
-
-pub(crate) fn unescaped(text: &str) -> Option<String> {
-    let mut bytes = Vec::with_capacity(text.len());
-    let mut rest = text.bytes();
-    while let Some(byte) = rest.next() {
-        bytes.push(match byte {
-            b'+' => b' ',
-            b'%' => {
-                let (high, low) = (digit(rest.next()?)?, digit(rest.next()?)?);
-                high << 4 | low
-            }
-            byte => byte,
-        });
-    }
-    String::from_utf8(bytes).ok()
-}
-
-fn digit(byte: u8) -> Option<u8> {
-    char::from(byte)
-        .to_digit(16)
-        .and_then(|digit| u8::try_from(digit).ok())
 }
 
 /// Returns all questions with their parameters.

@@ -322,7 +322,7 @@ fn take(contents: &mut Contents, mut entry: &[u8]) -> Option<()> {
         let (statements, rest) = rest.split_at_checked(size.parse().ok()?)?;
         entry = rest;
         let kind: SourceKind = kind.parse().ok()?;
-        let source = Source::new(kind, &crate::http::unescaped(name)?);
+        let source = Source::new(kind, &uri_text::unescaped(name)?);
         let (at, removed): (u64, usize) = (at.parse().ok()?, removed.parse().ok()?);
         let triples = RdfParser::from_format(RdfFormat::NTriples).for_slice(statements);
         let mut triples = triples.map(|quad| quad.map(Triple::from).ok());

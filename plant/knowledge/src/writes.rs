@@ -15,10 +15,9 @@ use oxigraph::io::RdfFormat;
 use serde::Serialize;
 use serde_json::json;
 use tokio::sync::Semaphore;
+use uri_text::{is_loopback_host, unescaped};
 
-use crate::http::{
-    Refusal, Site, UPLOAD_TIME, accepted, content, form, is_loopback_host, json_page, unescaped,
-};
+use crate::http::{Refusal, Site, UPLOAD_TIME, accepted, content, form, json_page};
 use crate::lanes::Lane;
 use crate::query::{Asked, LARGEST_UPDATE, QueryFault};
 use crate::source::{SourceKind, UNNAMED};

@@ -34,5 +34,6 @@ pub use model::{
     Module, Node, OpcUaServer, Output, OutputRole, Parameter, Procedure, Role, Service, ValueKind,
     Variable,
 };
-pub use rdf::{Object, Triple, escaped, unit_symbol};
+pub use rdf::{Object, Triple, unit_symbol};
 pub use rdf_module::state_iri;
+pub use uri_text::escaped;

@@ -6,7 +6,9 @@
 //! the same name in a module, are therefore distinct.
 
 use std::collections::{BTreeMap, HashSet};
-use std::fmt::{self, Write as _};
+use std::fmt;
+
+use uri_text::escaped;
 
 use crate::model::{
     Access, Bound, Edition, Identifier, Module, Node, Parameter, Procedure, Role, Service,
@@ -116,23 +118,6 @@ impl Module {
         graph.module(self);
         graph.all
     }
-}
-
-/// Escapes a text for a part of an IRI: all characters except ASCII letters, digits, `-`, `.`, `_`
-/// and `~` become `%XX`.
-#[must_use]
-pub fn escaped(text: &str) -> String {
-    let mut escaped = String::with_capacity(text.len());
-    for byte in text.bytes() {
-        match byte {
-            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
-                escaped.push(char::from(byte))
-            }
-            // Writing to a String cannot fail.
-            _ => drop(write!(escaped, "%{byte:02X}")),
-        }
-    }
-    escaped
 }
 
 impl Node {

@@ -1,7 +1,8 @@
 //! Statements about the servers, nodes, data assemblies, outputs and state machines of a module.
 
+use crate::escaped;
 use crate::model::{Alarm, DataAssembly, Family, Link, Module, Output, OutputRole, Role, Service};
-use crate::rdf::{ModuleStatements, Object, escaped};
+use crate::rdf::{ModuleStatements, Object};
 use crate::state::{Command, State};
 use crate::vocabulary as v;
 

@@ -19,7 +19,7 @@ use serde_json::{Value, json};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 
-use super::{RequestBody, bytes, is_loopback_name};
+use super::{RequestBody, bytes};
 use crate::fetch::FetchFault;
 use crate::mes::{Credentials, Mes, MesFault, SourceFile, source_kind};
 use crate::operations::Operations;
@@ -116,7 +116,7 @@ pub(super) async fn upload(
     let place = place.map_err(|_| busy("files"))?;
     let file = source_file(request).await?;
     let mes = mes(page).await?;
-    if !is_loopback_name(mes.authority()) {
+    if !uri_text::is_loopback_host(mes.authority()) {
         let why = "ua-mes is not on this host: load the file there with ua-space source add";
         return Err(Refusal::new(StatusCode::CONFLICT, why));
     }

@@ -3,10 +3,10 @@
 use std::fmt;
 use std::time::Duration;
 
-use http_client::encoded;
 use serde_json::{Map, Value as Json};
 use skills::yaml::{Code, Kind, Node, Reader};
 use skills::{InvalidParameter, Parameters, Value};
+use uri_text::escaped;
 
 use crate::http::{Asked, Fault, Host};
 use crate::tls::{self, Tls};
@@ -184,7 +184,7 @@ fn filled_path(
         Some(at) => template.split_at(at),
         None => (template, ""),
     };
-    let part = |text: &str| fill(text, &|name| Ok(encoded(&plain(&value(name)?))));
+    let part = |text: &str| fill(text, &|name| Ok(escaped(&plain(&value(name)?))));
     let segment = |template: &str| {
         let segment = part(template)?;
         let name = template.split(['{', '}']).nth(1);
