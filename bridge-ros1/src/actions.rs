@@ -14,7 +14,7 @@ use bridge_node::actions::{
     ActionClient, ActionGraph, ActionServer, CancelAnswer, CancelRequest, CancelWhat, GoalEvent,
     GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
 };
-use bridge_node::{CallFault, Ran};
+use bridge_node::{CallFault, GraphError, Ran};
 use bytes::Bytes;
 use md5::{Digest, Md5};
 use messages::{
@@ -38,7 +38,7 @@ impl ActionGraph for Ros1Graph<'_> {
     type Sender = Sender;
     type Taker = Taker;
 
-    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, String> {
+    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError> {
         let calls = self.definitions.action_calls(name);
         calls.map_err(|error| unknown(self.definitions, name, &error))
     }
@@ -48,7 +48,7 @@ impl ActionGraph for Ros1Graph<'_> {
         action: &str,
         type_name: &TypeName,
         waits: Waits,
-    ) -> Result<Sender, String> {
+    ) -> Result<Sender, GraphError> {
         let found = self.definitions.action(type_name);
         let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
         let options = ActionClientOptions {
@@ -70,7 +70,7 @@ impl ActionGraph for Ros1Graph<'_> {
         })
     }
 
-    fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Taker, String> {
+    fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Taker, GraphError> {
         let found = self.definitions.action(type_name);
         let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
         let empty_result = empty(action_type.result())?;
@@ -87,14 +87,14 @@ impl ActionGraph for Ros1Graph<'_> {
     }
 }
 
-fn unknown(definitions: &mut Definitions, name: &TypeName, error: &DefinitionError) -> String {
+fn unknown(definitions: &mut Definitions, name: &TypeName, error: &DefinitionError) -> GraphError {
     let wanted = format!(
         "action connections do not carry the definition of the goal: a folder below ROS_PACKAGE_PATH must \
          contain {}/action/{}.action",
         name.package(),
         name.name()
     );
-    definitions.explain_missing((TextKind::Action, name), error, &wanted)
+    GraphError::MissingType(definitions.explain_missing((TextKind::Action, name), error, &wanted))
 }
 
 /// Returns the types of the topics of an action.
@@ -112,16 +112,14 @@ fn types(action: &ActionType) -> tcpros::actionlib::ActionType {
 }
 
 /// Returns a message of the type with default values.
-fn empty(message_type: &Arc<MessageType>) -> Result<Bytes, String> {
+fn empty(message_type: &Arc<MessageType>) -> Result<Bytes, GraphError> {
     let nothing = Selection::Template {
         fields: Vec::new(),
         rest: BTreeMap::new(),
     };
-    let plan = Plan::compile(message_type, &nothing, Wire::Ros1);
-    let plan = plan.map_err(|error| error.to_string())?;
+    let plan = Plan::compile(message_type, &nothing, Wire::Ros1)?;
     let mut bytes = Vec::new();
-    let written = plan.write(&mut NoFields, &mut bytes);
-    written.map_err(|error| error.to_string())?;
+    plan.write(&mut NoFields, &mut bytes)?;
     Ok(bytes.into())
 }
 
@@ -486,12 +484,9 @@ impl NewGoal for New {
         self.goal.as_ref().map_or(&NOTHING, ServerGoal::body)
     }
 
-    async fn accept(mut self) -> Result<Served, String> {
-        let goal = self
-            .goal
-            .take()
-            .ok_or("the goal was already accepted or rejected")?;
-        goal.accept("").map_err(|error| error.to_string())?;
+    async fn accept(mut self) -> Result<Served, GraphError> {
+        let goal = self.goal.take().ok_or(GraphError::GoalAnswered)?;
+        goal.accept("").map_err(GraphError::library)?;
         Ok(Served {
             goal,
             empty_result: std::mem::take(&mut self.empty_result),
@@ -530,7 +525,7 @@ impl CancelRequest for Cancel {
         self.0
     }
 
-    fn accept(self) -> Result<(), String> {
+    fn accept(self) -> Result<(), GraphError> {
         Ok(())
     }
 
@@ -548,12 +543,12 @@ impl ServedGoal for Served {
     // The goal is active from its acceptance.
     fn execute(&self) {}
 
-    fn feedback(&self, body: &[u8]) -> Result<(), String> {
+    fn feedback(&self, body: &[u8]) -> Result<(), GraphError> {
         let told = self.goal.feedback(body);
-        told.map_err(|error| error.to_string())
+        told.map_err(GraphError::library)
     }
 
-    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), String> {
+    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), GraphError> {
         let ended = match status {
             SUCCEEDED => self
                 .goal
@@ -561,7 +556,7 @@ impl ServedGoal for Served {
             CANCELED => self.goal.cancelled(result, message),
             _ => self.goal.abort(result, message),
         };
-        ended.map_err(|error| error.to_string())
+        ended.map_err(GraphError::library)
     }
 }
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
 
+use bridge_node::GraphError;
 use tcpros::actionlib::ActionError;
 use tokio::sync::Mutex;
 
@@ -29,13 +30,13 @@ pub(crate) fn shared<E>(
     known: &mut BTreeMap<String, Known<E>>,
     (action, md5): (&str, &str),
     make: impl FnOnce() -> Result<E, ActionError>,
-) -> Result<Arc<E>, String> {
+) -> Result<Arc<E>, GraphError> {
     known.retain(|_, known| known.end.strong_count() > 0);
     let in_use = known.get(action).filter(|known| known.md5 == md5);
     if let Some(end) = in_use.and_then(|known| known.end.upgrade()) {
         return Ok(end);
     }
-    let end = Arc::new(make().map_err(|error| error.to_string())?);
+    let end = Arc::new(make().map_err(GraphError::library)?);
     let made = Known {
         md5: md5.to_owned(),
         end: Arc::downgrade(&end),

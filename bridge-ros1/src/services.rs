@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, ServiceGraph};
+use bridge_node::{
+    Asker, CallFault, CallGraph, ExecutorGraph, GraphError, Ran, ServiceCall, ServiceGraph,
+};
 use bytes::Bytes;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
 use tcpros::{
@@ -28,7 +30,7 @@ impl ServiceGraph for Ros1Graph<'_> {
 
     const WIRE: Wire = Wire::Ros1;
 
-    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
+    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, GraphError> {
         self.definitions.service(name).map_err(|error| {
             let wanted = format!(
                 "service connections do not carry the definition: a folder below ROS_PACKAGE_PATH must \
@@ -37,7 +39,7 @@ impl ServiceGraph for Ros1Graph<'_> {
                 name.name()
             );
             let of = (TextKind::Service, name);
-            self.definitions.explain_missing(of, &error, &wanted)
+            GraphError::MissingType(self.definitions.explain_missing(of, &error, &wanted))
         })
     }
 
@@ -45,11 +47,10 @@ impl ServiceGraph for Ros1Graph<'_> {
         &mut self,
         builtin: BuiltinType,
         array: bool,
-    ) -> Result<Option<Arc<MessageType>>, String> {
+    ) -> Result<Option<Arc<MessageType>>, GraphError> {
         let name = self.definitions.standard_type(builtin, array);
-        name.map(|name| self.definitions.get(&name))
-            .transpose()
-            .map_err(|error| error.to_string())
+        let found = name.map(|name| self.definitions.get(&name));
+        Ok(found.transpose()?)
     }
 
     fn client(
@@ -57,7 +58,7 @@ impl ServiceGraph for Ros1Graph<'_> {
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Client, String> {
+    ) -> Result<Client, GraphError> {
         let options = ServiceClientOptions {
             md5sum: Some(service_type.md5().to_owned()),
             type_name: Some(service_type.name().to_string()),
@@ -66,7 +67,7 @@ impl ServiceGraph for Ros1Graph<'_> {
             ..ServiceClientOptions::default()
         };
         let client = self.node.service_client(service, options);
-        client.map(Client::from).map_err(|error| error.to_string())
+        client.map(Client::from).map_err(GraphError::library)
     }
 }
 
@@ -80,7 +81,7 @@ impl CallGraph for Ros1Graph<'_> {
         service: &str,
         service_type: &Arc<ServiceType>,
         asker: Asker,
-    ) -> Result<ServiceServer, String> {
+    ) -> Result<ServiceServer, GraphError> {
         let service_type = tcpros::ServiceType {
             name: service_type.name().to_string(),
             md5sum: service_type.md5().to_owned(),
@@ -95,7 +96,7 @@ impl CallGraph for Ros1Graph<'_> {
         let server = self
             .node
             .advertise_service(service, service_type, options, handler);
-        server.map_err(|error| error.to_string())
+        server.map_err(GraphError::library)
     }
 }
 
@@ -107,7 +108,7 @@ impl ExecutorGraph for Ros1Graph<'_> {
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Executor, String> {
+    ) -> Result<Executor, GraphError> {
         let client = |persistent| {
             let options = ServiceClientOptions {
                 md5sum: Some(service_type.md5().to_owned()),
@@ -117,7 +118,7 @@ impl ExecutorGraph for Ros1Graph<'_> {
                 ..ServiceClientOptions::default()
             };
             let client = self.node.service_client(service, options);
-            client.map(Client::from).map_err(|error| error.to_string())
+            client.map(Client::from).map_err(GraphError::library)
         };
         Ok(Executor {
             kept: client(true)?,

@@ -8,7 +8,7 @@ use bridge_node::actions::{
     ActionClient as Sends, ActionGraph, ActionServer as Takes, CancelAnswer, CancelRequest,
     CancelWhat, GoalEvent, GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
 };
-use bridge_node::{CallFault, Ran};
+use bridge_node::{CallFault, GraphError, Ran};
 use bytes::Bytes;
 use messages::{ActionCalls, MessageType, NoFields, Plan, Selection, TextKind, TypeName, Wire};
 use ros2_node::action::{
@@ -25,7 +25,7 @@ impl ActionGraph for Ros2Graph<'_> {
     type Sender = Client;
     type Taker = Server;
 
-    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, String> {
+    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError> {
         let found = self.definitions.action_calls(name);
         found.map_err(|error| {
             let wanted = format!(
@@ -35,7 +35,7 @@ impl ActionGraph for Ros2Graph<'_> {
                 name.name()
             );
             let of = (TextKind::Action, name);
-            self.definitions.explain_missing(of, &error, &wanted)
+            GraphError::MissingType(self.definitions.explain_missing(of, &error, &wanted))
         })
     }
 
@@ -44,7 +44,7 @@ impl ActionGraph for Ros2Graph<'_> {
         action: &str,
         type_name: &TypeName,
         waits: Waits,
-    ) -> Result<Client, String> {
+    ) -> Result<Client, GraphError> {
         let action = self.action(action, type_name);
         let options = ActionClientOptions {
             server_timeout: waits.silence,
@@ -54,12 +54,11 @@ impl ActionGraph for Ros2Graph<'_> {
         };
         action::ActionClient::open(self.domain, self.peers, &action, options)
             .map(Client)
-            .map_err(|error| error.to_string())
+            .map_err(GraphError::library)
     }
 
-    fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Server, String> {
-        let messages = self.definitions.action_messages(type_name);
-        let messages = messages.map_err(|error| error.to_string())?;
+    fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Server, GraphError> {
+        let messages = self.definitions.action_messages(type_name)?;
         let empty_result = empty(messages.result_response())?;
         let action = self.action(action, type_name);
         let options = ActionServerOptions {
@@ -69,7 +68,7 @@ impl ActionGraph for Ros2Graph<'_> {
         };
         action::ActionServer::open(self.domain, self.peers, &action, options)
             .map(Server)
-            .map_err(|error| error.to_string())
+            .map_err(GraphError::library)
     }
 }
 
@@ -85,15 +84,14 @@ impl Ros2Graph<'_> {
 }
 
 /// Encodes a message without field values, as little-endian CDR.
-fn empty(message: &Arc<MessageType>) -> Result<Bytes, String> {
+fn empty(message: &Arc<MessageType>) -> Result<Bytes, GraphError> {
     let nothing = Selection::Template {
         fields: Vec::new(),
         rest: BTreeMap::new(),
     };
-    let plan = Plan::compile(message, &nothing, Wire::Cdr).map_err(|error| error.to_string())?;
+    let plan = Plan::compile(message, &nothing, Wire::Cdr)?;
     let mut bytes = Vec::new();
-    plan.write(&mut NoFields, &mut bytes)
-        .map_err(|error| error.to_string())?;
+    plan.write(&mut NoFields, &mut bytes)?;
     Ok(bytes.into())
 }
 
@@ -227,8 +225,8 @@ impl NewGoal for New {
         self.0.body()
     }
 
-    async fn accept(self) -> Result<Served, String> {
-        let goal = self.0.accept().await.map_err(|error| error.to_string())?;
+    async fn accept(self) -> Result<Served, GraphError> {
+        let goal = self.0.accept().await.map_err(GraphError::library)?;
         Ok(Served(goal))
     }
 
@@ -248,8 +246,8 @@ impl CancelRequest for Cancel {
         self.0.id().to_bytes()
     }
 
-    fn accept(self) -> Result<(), String> {
-        self.0.accept().map_err(|error| error.to_string())
+    fn accept(self) -> Result<(), GraphError> {
+        self.0.accept().map_err(GraphError::library)
     }
 
     fn reject(self) {
@@ -284,11 +282,11 @@ impl ServedGoal for Served {
         }
     }
 
-    fn feedback(&self, body: &[u8]) -> Result<(), String> {
-        self.0.feedback(body).map_err(|error| error.to_string())
+    fn feedback(&self, body: &[u8]) -> Result<(), GraphError> {
+        self.0.feedback(body).map_err(GraphError::library)
     }
 
-    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), String> {
+    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), GraphError> {
         if !message.is_empty() {
             // Results of ROS 2 carry no message.
             debug!(goal = %self.0.id(), status, message, "a goal ends");
@@ -304,7 +302,7 @@ impl ServedGoal for Served {
                 (_, None) => self.0.abort(&self.0.empty_result()),
             }
         };
-        end().map_err(|error| error.to_string())
+        end().map_err(GraphError::library)
     }
 }
 

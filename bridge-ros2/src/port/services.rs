@@ -4,7 +4,9 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, ServiceGraph};
+use bridge_node::{
+    Asker, CallFault, CallGraph, ExecutorGraph, GraphError, Ran, ServiceCall, ServiceGraph,
+};
 use bytes::Bytes;
 use mappings::SpaceId;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
@@ -30,7 +32,7 @@ impl ServiceGraph for Ros2Graph<'_> {
 
     const WIRE: Wire = Wire::Cdr;
 
-    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
+    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, GraphError> {
         self.definitions.service(name).map_err(|error| {
             let wanted = format!(
                 "discovery does not carry the definition of a service: a prefix in AMENT_PREFIX_PATH must \
@@ -39,7 +41,7 @@ impl ServiceGraph for Ros2Graph<'_> {
                 name.name()
             );
             let of = (TextKind::Service, name);
-            self.definitions.explain_missing(of, &error, &wanted)
+            GraphError::MissingType(self.definitions.explain_missing(of, &error, &wanted))
         })
     }
 
@@ -47,12 +49,10 @@ impl ServiceGraph for Ros2Graph<'_> {
         &mut self,
         builtin: BuiltinType,
         array: bool,
-    ) -> Result<Option<Arc<MessageType>>, String> {
+    ) -> Result<Option<Arc<MessageType>>, GraphError> {
         let name = self.definitions.standard_type(builtin, array);
-        name.map(|name| self.definitions.here(&name))
-            .transpose()
-            .map(|found| found.map(|found| found.message_type))
-            .map_err(|error| error.to_string())
+        let found = name.map(|name| self.definitions.here(&name)).transpose()?;
+        Ok(found.map(|found| found.message_type))
     }
 
     fn client(
@@ -60,7 +60,7 @@ impl ServiceGraph for Ros2Graph<'_> {
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Client, String> {
+    ) -> Result<Client, GraphError> {
         let service = Service::new(service, service_type.name());
         if let Some(hashes) = self.definitions.service_type_hashes(service_type.name()) {
             service.announce(self.domain, &hashes);
@@ -71,7 +71,7 @@ impl ServiceGraph for Ros2Graph<'_> {
         };
         ServiceClient::open(self.domain, self.peers, &service, options)
             .map(Client::from)
-            .map_err(|error| error.to_string())
+            .map_err(GraphError::library)
     }
 }
 
@@ -83,7 +83,7 @@ impl ExecutorGraph for Ros2Graph<'_> {
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Client, String> {
+    ) -> Result<Client, GraphError> {
         self.client(service, service_type, timeout)
     }
 }
@@ -99,7 +99,7 @@ impl CallGraph for Ros2Graph<'_> {
         service: &str,
         service_type: &Arc<ServiceType>,
         asker: Asker,
-    ) -> Result<ServiceServer, String> {
+    ) -> Result<ServiceServer, GraphError> {
         let service = Service::new(service, service_type.name());
         if let Some(hashes) = self.definitions.service_type_hashes(service_type.name()) {
             service.announce(self.domain, &hashes);
@@ -112,7 +112,7 @@ impl CallGraph for Ros2Graph<'_> {
         };
         let handler = move |request: ServiceRequest| asker.ask(request.bytes);
         ServiceServer::open(self.domain, self.peers, &service, options, handler)
-            .map_err(|error| error.to_string())
+            .map_err(GraphError::library)
     }
 }
 

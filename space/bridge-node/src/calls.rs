@@ -19,7 +19,7 @@ use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info};
 
 use crate::policy::{Policy, call_type};
-use crate::{PortEvent, ServiceGraph};
+use crate::{GraphError, PortEvent, ServiceGraph};
 
 /// A ROS graph that can offer services.
 pub trait CallGraph: ServiceGraph {
@@ -32,13 +32,13 @@ pub trait CallGraph: ServiceGraph {
     /// Offers a service: each request goes to `asker`.
     ///
     /// # Errors
-    /// The reason why the service cannot be offered, as text for the user.
+    /// The reason why the service cannot be offered.
     fn offer(
         &mut self,
         service: &str,
         service_type: &Arc<ServiceType>,
         asker: Asker,
-    ) -> Result<Self::Server, String>;
+    ) -> Result<Self::Server, GraphError>;
 }
 
 /// The calls of other spaces that a port knows, and the open requests of its graph.

@@ -23,7 +23,7 @@ use crate::policy::Policy;
 use crate::port::Execution;
 use crate::present::{self, Present};
 use crate::services::{CallFault, Ran, ServiceCall};
-use crate::{PortEvent, ServiceGraph};
+use crate::{GraphError, PortEvent, ServiceGraph};
 
 /// A ROS graph with services that can be executed for other spaces.
 pub trait ExecutorGraph: ServiceGraph {
@@ -33,13 +33,13 @@ pub trait ExecutorGraph: ServiceGraph {
     /// Creates a client of a service with a timeout for each call.
     ///
     /// # Errors
-    /// The reason why the client cannot be created, as text for the user.
+    /// The reason why the client cannot be created.
     fn executor(
         &mut self,
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Self::Executor, String>;
+    ) -> Result<Self::Executor, GraphError>;
 }
 
 /// The services of a graph that are executed for the space.
@@ -168,11 +168,12 @@ impl<C: ServiceCall + Sync> Executing<C> {
         graph: &mut G,
         topic: TopicId,
         wanted: &Wanted,
-    ) -> Result<PortEvent, String> {
+    ) -> Result<PortEvent, GraphError> {
         if self.served.len() >= MOST_SERVED {
-            return Err(format!(
-                "the limit of {MOST_SERVED} offered services is reached"
-            ));
+            return Err(GraphError::Full {
+                most: MOST_SERVED,
+                ends: "services",
+            });
         }
         let service_type = graph.service_type(&wanted.type_name)?;
         let client = graph.executor(&wanted.service, &service_type, wanted.timeout)?;

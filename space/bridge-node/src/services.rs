@@ -25,7 +25,7 @@ pub use self::caller::{CallFault, Outcome, Ran, ServiceCall};
 
 use self::caller::{Caller, Source};
 use self::pending::Pending;
-use crate::PortEvent;
+use crate::{GraphError, PortEvent};
 
 /// A ROS graph with services, as implemented by a port.
 pub trait ServiceGraph {
@@ -38,30 +38,30 @@ pub trait ServiceGraph {
     /// Returns the service type of a name.
     ///
     /// # Errors
-    /// The reason why there is no such type, as text for the user.
-    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String>;
+    /// The reason why there is no such type.
+    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, GraphError>;
 
     /// Returns the message type that carries one value of a type and nothing else; `None` if there
     /// is no such message type.
     ///
     /// # Errors
-    /// The reason why the definition of the message type is not known, as text for the user.
+    /// The reason why the definition of the message type is not known.
     fn carrier(
         &mut self,
         builtin: BuiltinType,
         array: bool,
-    ) -> Result<Option<Arc<MessageType>>, String>;
+    ) -> Result<Option<Arc<MessageType>>, GraphError>;
 
     /// Creates a client of a service with a timeout for each call.
     ///
     /// # Errors
-    /// The reason why the client cannot be created, as text for the user.
+    /// The reason why the client cannot be created.
     fn client(
         &mut self,
         service: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Self::Client, String>;
+    ) -> Result<Self::Client, GraphError>;
 }
 
 /// The service calls of a bridge.
@@ -285,7 +285,7 @@ impl Services {
         graph: &mut G,
         variable: &Variable,
         role: &ServiceRole,
-    ) -> Result<PortEvent, String> {
+    ) -> Result<PortEvent, GraphError> {
         let ServiceRole::Call {
             service,
             service_type,
@@ -294,7 +294,7 @@ impl Services {
             timeout,
         } = role
         else {
-            return Err("it has no call".to_owned());
+            return Err(GraphError::OtherRole { expected: "call" });
         };
         let service_type = graph.service_type(service_type)?;
         let message_type = service_type.request();
@@ -353,13 +353,13 @@ impl Services {
         mapping: &Mapping,
         variable: &Variable,
         (of, selection): (TopicId, &Selection),
-    ) -> Result<PortEvent, String> {
+    ) -> Result<PortEvent, GraphError> {
         let role = mapping
             .variable(of)
             .and_then(|of| of.service.as_ref())
             .map(|binding| &binding.role);
         let Some(ServiceRole::Call { service_type, .. }) = role else {
-            return Err(format!("{of} calls no service"));
+            return Err(GraphError::CallsNothing { of });
         };
         let service_type = graph.service_type(service_type)?;
         let takers = self.takers.entry(Source::Value(of)).or_default();
@@ -372,7 +372,7 @@ impl Services {
         graph: &mut G,
         variable: &Variable,
         role: &ServiceRole,
-    ) -> Result<PortEvent, String> {
+    ) -> Result<PortEvent, GraphError> {
         let ServiceRole::Poll {
             service,
             service_type: name,
@@ -382,7 +382,7 @@ impl Services {
             timeout,
         } = role
         else {
-            return Err("it has no poll".to_owned());
+            return Err(GraphError::OtherRole { expected: "poll" });
         };
         let service_type = graph.service_type(name)?;
         let known = self.polls.iter().find(|known| known.serves(role));
@@ -413,7 +413,7 @@ impl Services {
         graph: &mut G,
         target: &Target<'_>,
         of: Source,
-    ) -> Result<Caller<G::Client>, String> {
+    ) -> Result<Caller<G::Client>, GraphError> {
         let client = graph.client(target.service, &target.service_type, target.timeout)?;
         Ok(Caller::new(client, of, self.report.clone()))
     }
@@ -549,24 +549,24 @@ fn bound(topic: TopicId, service_type: &ServiceType, selection: &Selection) -> P
 }
 
 /// Returns the message type of a value that is only compared, not sent.
-fn carrier(graph: &mut impl ServiceGraph, variable: &Variable) -> Result<Arc<MessageType>, String> {
-    let (builtin, array) = variable
-        .value_type
-        .ok_or("a variable needs a `type` if its value is not part of the request")?;
+fn carrier(
+    graph: &mut impl ServiceGraph,
+    variable: &Variable,
+) -> Result<Arc<MessageType>, GraphError> {
+    let (builtin, array) = variable.value_type.ok_or(GraphError::NoValueType)?;
     graph
         .carrier(builtin, array)?
-        .ok_or_else(|| format!("a value of type {builtin:?} cannot be compared with `when`"))
+        .ok_or(GraphError::NotComparable { builtin })
 }
 
 /// Encodes the message of a template without values.
 fn constant<G: ServiceGraph>(
     message_type: &Arc<MessageType>,
     template: &Selection,
-) -> Result<Bytes, String> {
-    let plan = Plan::compile(message_type, template, G::WIRE).map_err(|error| error.to_string())?;
+) -> Result<Bytes, GraphError> {
+    let plan = Plan::compile(message_type, template, G::WIRE)?;
     let mut bytes = Vec::new();
-    plan.write(&mut NoFields, &mut bytes)
-        .map_err(|error| error.to_string())?;
+    plan.write(&mut NoFields, &mut bytes)?;
     Ok(bytes.into())
 }
 

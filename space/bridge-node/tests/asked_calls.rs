@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use bridge_node::policy::Policy;
 use bridge_node::{
     AskError, AskErrorKind, AskId, Asker, CallDescription, CallFault, CallField, CallGraph,
-    CallRole, Calls, PortEvent, ServiceCall, ServiceGraph, now,
+    CallRole, Calls, GraphError, PortEvent, ServiceCall, ServiceGraph, now,
 };
 use bytes::Bytes;
 use mappings::{SpaceId, TopicId};
@@ -54,17 +54,15 @@ impl ServiceGraph for Fake {
 
     const WIRE: Wire = Wire::Cdr;
 
-    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
-        self.registry
-            .service(name)
-            .map_err(|error| error.to_string())
+    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, GraphError> {
+        Ok(self.registry.service(name)?)
     }
 
-    fn carrier(&mut self, _: BuiltinType, _: bool) -> Result<Option<Arc<MessageType>>, String> {
+    fn carrier(&mut self, _: BuiltinType, _: bool) -> Result<Option<Arc<MessageType>>, GraphError> {
         Ok(None)
     }
 
-    fn client(&mut self, _: &str, _: &ServiceType, _: Duration) -> Result<NoClient, String> {
+    fn client(&mut self, _: &str, _: &ServiceType, _: Duration) -> Result<NoClient, GraphError> {
         Ok(NoClient)
     }
 }
@@ -79,7 +77,7 @@ impl CallGraph for Fake {
         service: &str,
         _: &Arc<ServiceType>,
         asker: Asker,
-    ) -> Result<Server, String> {
+    ) -> Result<Server, GraphError> {
         let mut offered = self.offered.lock().unwrap();
         offered.insert(service.to_owned(), asker);
         Ok(Server(service.to_owned(), Arc::clone(&self.offered)))

@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use bridge_node::policy::Policy;
 use bridge_node::{
-    CallFault, Executed, Executing, Execution, ExecutionId, ExecutorGraph, PortEvent, Present, Ran,
-    Refusal, ServiceCall, ServiceGraph, now,
+    CallFault, Executed, Executing, Execution, ExecutionId, ExecutorGraph, GraphError, PortEvent,
+    Present, Ran, Refusal, ServiceCall, ServiceGraph, now,
 };
 use bytes::Bytes;
 use mappings::{Call, CallKind, CallTarget, ExecutedBy, Mapping, NodeIdText, SpaceId, TopicId};
@@ -46,16 +46,15 @@ impl ServiceGraph for Fake {
 
     const WIRE: Wire = Wire::Cdr;
 
-    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
-        let found = self.registry.service(name);
-        found.map_err(|error| error.to_string())
+    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, GraphError> {
+        Ok(self.registry.service(name)?)
     }
 
-    fn carrier(&mut self, _: BuiltinType, _: bool) -> Result<Option<Arc<MessageType>>, String> {
+    fn carrier(&mut self, _: BuiltinType, _: bool) -> Result<Option<Arc<MessageType>>, GraphError> {
         Ok(None)
     }
 
-    fn client(&mut self, name: &str, _: &ServiceType, _: Duration) -> Result<Client, String> {
+    fn client(&mut self, name: &str, _: &ServiceType, _: Duration) -> Result<Client, GraphError> {
         let (may, answers) = (Arc::clone(&self.may), Arc::clone(&self.answers));
         Ok(Client(name.to_owned(), may, answers))
     }
@@ -69,7 +68,7 @@ impl ExecutorGraph for Fake {
         name: &str,
         service_type: &ServiceType,
         timeout: Duration,
-    ) -> Result<Client, String> {
+    ) -> Result<Client, GraphError> {
         self.client(name, service_type, timeout)
     }
 }

@@ -16,11 +16,11 @@ use super::encoding::Encoding;
 use super::graph::{ActionGraph, Waits};
 use super::pending::AllPending;
 use super::serving::{Action, Command, Part, Serving};
-use crate::PortEvent;
 use crate::clock::now;
 use crate::policy::Policy;
 use crate::port::Execution;
 use crate::present::{self, Present};
+use crate::{GraphError, PortEvent};
 
 /// The actions of the graph that are executed for the space.
 #[derive(Debug, Default)]
@@ -149,24 +149,26 @@ impl Executors {
         (graph, mapping): (&mut G, &Mapping),
         (topic, wanted): (TopicId, &Wanted),
         report: &mpsc::Sender<PortEvent>,
-    ) -> Result<Vec<PortEvent>, String> {
+    ) -> Result<Vec<PortEvent>, GraphError> {
         if self.served.len() >= MOST_SERVED {
-            return Err(format!(
-                "the limit of {MOST_SERVED} offered actions is reached"
-            ));
+            return Err(GraphError::Full {
+                most: MOST_SERVED,
+                ends: "actions",
+            });
         }
         let (_, _, id) = topic.triple();
         let family = ActionFamily::behind(id);
-        let family = family
-            .ok_or("an action takes five consecutive identifiers, and fewer follow its own")?;
-        let of = |id| beside(topic, id).ok_or("0 is not an identifier");
+        let family = family.ok_or(GraphError::NoFamily)?;
+        let of = |id| beside(topic, id).ok_or(GraphError::NoFamily);
         let (cancel, result) = (of(family.cancel)?, of(family.result)?);
         let (feedback, status) = (of(family.feedback)?, of(family.status)?);
         let all = [topic, cancel, result, feedback, status];
         if let Some(taken) = all.into_iter().find(|of| self.is_taken(mapping, *of)) {
-            return Err(format!(
-                "it takes the topics {topic} to {status}, but {taken} belongs to a variable or another action"
-            ));
+            return Err(GraphError::TopicTaken {
+                first: topic,
+                last: status,
+                taken,
+            });
         }
         let calls = graph.action_calls(&wanted.type_name)?;
         let client = graph.action_client(&wanted.action, &wanted.type_name, wanted.waits)?;

@@ -139,7 +139,7 @@ async fn drive<N: NewGoal>(asks: Asks, new: N, told: Told) {
         result,
     } = follow(&asks, id, &goal, told).await;
     if let Err(why) = goal.end(status, &message, result.as_deref()) {
-        debug!(why, "cannot report the end of a goal");
+        debug!(%why, "cannot report the end of a goal");
     }
 }
 
@@ -156,7 +156,7 @@ async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
     }
     let accepted = new.accept().await;
     accepted
-        .inspect_err(|why| debug!(why, "an accepted goal continues without its client"))
+        .inspect_err(|why| debug!(%why, "an accepted goal continues without its client"))
         .ok()
 }
 
@@ -185,7 +185,7 @@ async fn follow(asks: &Asks, id: GoalId, goal: &impl ServedGoal, told: Told) -> 
 
 fn hand_to(goal: &impl ServedGoal, feedback: &[u8]) {
     if let Err(why) = goal.feedback(feedback) {
-        debug!(why, "cannot publish feedback");
+        debug!(%why, "cannot publish feedback");
     }
 }
 
@@ -321,7 +321,7 @@ async fn cancel<C: CancelRequest>(asks: Asks, request: C) {
     if !agreed.await.unwrap_or(false) {
         request.reject();
     } else if let Err(why) = request.accept() {
-        debug!(why, "ended a goal whose cancellation is in progress");
+        debug!(%why, "ended a goal whose cancellation is in progress");
     }
 }
 

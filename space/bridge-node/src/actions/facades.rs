@@ -17,7 +17,7 @@ use super::facade::{Asks, Facade};
 use super::graph::ActionGraph;
 use crate::policy::{Policy, action_type};
 use crate::port::Delivery;
-use crate::{Asker, PortEvent};
+use crate::{Asker, GraphError, PortEvent};
 
 /// The known actions of other spaces.
 #[derive(Debug, Default)]
@@ -266,7 +266,7 @@ impl Facades {
             let waits = policy.mapping().pubsub().receive_timeout;
             let with = (&asker, report, waits, tasks);
             let offered = match known.variable(topic, policy.mapping()) {
-                Some(variable) => Err(format!("its {variable} is also a variable of the mapping")),
+                Some(topic) => Err(GraphError::IsVariable { topic }),
                 None => known.offer(graph, (topic, target), with),
             };
             match offered {
@@ -352,10 +352,10 @@ impl Known {
         graph: &mut G,
         (topic, target): (TopicId, Target),
         (asker, report, silence, tasks): With<'_, F>,
-    ) -> Result<Vec<PortEvent>, String> {
+    ) -> Result<Vec<PortEvent>, GraphError> {
         let said = (target.type_name.as_ref(), &*target.goal);
         let calls = action_type(&self.described, said, |name| graph.action_calls(name))?;
-        let of = |id| beside(topic, id).ok_or("it does not have five consecutive identifiers");
+        let of = |id| beside(topic, id).ok_or(GraphError::NoFamily);
         let (cancel, result) = (of(self.family.cancel)?, of(self.family.result)?);
         let (feedback, status) = (of(self.family.feedback)?, of(self.family.status)?);
         let type_name = calls.goal().name().clone();

@@ -10,8 +10,8 @@ use bytes::Bytes;
 use messages::{ActionCalls, TypeName};
 use uadp::Timestamp;
 
-use crate::ServiceGraph;
 use crate::services::{CallFault, Ran};
+use crate::{GraphError, ServiceGraph};
 
 /// Identifies a goal. In ROS 2 it is the UUID. In ROS 1, where ids are strings, it is the value of
 /// an id of 32 hex digits, or the MD5 of any other id.
@@ -31,25 +31,29 @@ pub trait ActionGraph: ServiceGraph {
     /// Returns the calls and values of an action type.
     ///
     /// # Errors
-    /// The reason why the type is not known, as text for the user.
-    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, String>;
+    /// The reason why the type is not known.
+    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError>;
 
     /// Creates a client of an action. The server is present, or was a moment ago.
     ///
     /// # Errors
-    /// The reason why the client cannot be created, as text for the user.
+    /// The reason why the client cannot be created.
     fn action_client(
         &mut self,
         action: &str,
         type_name: &TypeName,
         waits: Waits,
-    ) -> Result<Self::Sender, String>;
+    ) -> Result<Self::Sender, GraphError>;
 
     /// Serves an action until the returned server is dropped.
     ///
     /// # Errors
-    /// The reason why the action cannot be served, as text for the user.
-    fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Self::Taker, String>;
+    /// The reason why the action cannot be served.
+    fn serve_action(
+        &mut self,
+        action: &str,
+        type_name: &TypeName,
+    ) -> Result<Self::Taker, GraphError>;
 }
 
 /// Timeouts of an action client.
@@ -71,7 +75,7 @@ pub enum GoalEvent {
     /// An `X_Feedback`.
     Feedback(Bytes),
     /// The server has not decided about the goal in time. The goal is withdrawn: it is cancelled as
-    /// soon as it is accepted. The outcome follows. Carries the reason, as text for the user.
+    /// soon as it is accepted. The outcome follows. Carries the reason.
     Overdue(String),
     /// The goal was withdrawn, and the server, which has accepted it, refuses to cancel it.
     CancelRefused,
@@ -89,7 +93,7 @@ pub enum GoalEvent {
     Rejected(String),
     /// No further event of the goal can be received: the last event.
     Lost {
-        /// The reason, as text for the user.
+        /// The reason.
         text: String,
         /// Whether the server has, or had, the goal.
         ran: Ran,
@@ -177,8 +181,8 @@ pub trait NewGoal: Send + 'static {
     /// Accepts the goal.
     ///
     /// # Errors
-    /// The reason why the goal cannot be accepted, as text for the user.
-    fn accept(self) -> impl Future<Output = Result<Self::Goal, String>> + Send;
+    /// The reason why the goal cannot be accepted.
+    fn accept(self) -> impl Future<Output = Result<Self::Goal, GraphError>> + Send;
 
     /// Rejects the goal, with the reason if the client can receive it.
     fn reject(self, why: &str);
@@ -192,8 +196,8 @@ pub trait CancelRequest: Send + 'static {
     /// Accepts the request; the goal still has to be ended by [`ServedGoal::end`].
     ///
     /// # Errors
-    /// The reason why the request cannot be accepted, as text for the user.
-    fn accept(self) -> Result<(), String>;
+    /// The reason why the request cannot be accepted.
+    fn accept(self) -> Result<(), GraphError>;
 
     /// Rejects the request.
     fn reject(self);
@@ -207,14 +211,14 @@ pub trait ServedGoal: Send + Sync + 'static {
     /// Publishes feedback, an `X_Feedback`. Never waits.
     ///
     /// # Errors
-    /// The reason why the feedback cannot be published, as text for the user.
-    fn feedback(&self, body: &[u8]) -> Result<(), String>;
+    /// The reason why the feedback cannot be published.
+    fn feedback(&self, body: &[u8]) -> Result<(), GraphError>;
 
     /// Ends the goal: 4 succeeded, 5 canceled, any other value aborted. If no client has requested
     /// to cancel the goal, 5 aborts it in a ROS without such an end. `result` is as in
     /// [`GoalEvent::Ended`]; without a result the client receives the empty result.
     ///
     /// # Errors
-    /// The reason why the goal cannot be ended, as text for the user; the goal is not ended then.
-    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), String>;
+    /// The reason why the goal cannot be ended; the goal is not ended then.
+    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), GraphError>;
 }

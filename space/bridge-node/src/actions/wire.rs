@@ -10,6 +10,7 @@ use messages::{ActionCalls, Literal, NoFields, Plan, Selection, Wire};
 use uadp::Timestamp;
 
 use super::graph::{CancelAnswer, GoalId};
+use crate::GraphError;
 
 /// The response to a goal.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -152,12 +153,12 @@ pub(super) fn result_answer(
 /// Encodes the response without a result of a server: all fields of the result are zero or empty.
 ///
 /// # Errors
-/// The reason why the response cannot be encoded, as text for the user.
+/// The reason why the response cannot be encoded.
 pub(super) fn empty_result_answer(
     wire: Wire,
     calls: &Arc<ActionCalls>,
     (status, message): (i8, &str),
-) -> Result<Bytes, String> {
+) -> Result<Bytes, GraphError> {
     let one = |text: String| Literal::One(text);
     let template = Selection::Template {
         fields: Vec::new(),
@@ -167,11 +168,9 @@ pub(super) fn empty_result_answer(
         ]
         .into(),
     };
-    let plan = Plan::compile(calls.result().response(), &template, wire);
-    let plan = plan.map_err(|error| error.to_string())?;
+    let plan = Plan::compile(calls.result().response(), &template, wire)?;
     let mut bytes = Vec::new();
-    plan.write(&mut NoFields, &mut bytes)
-        .map_err(|error| error.to_string())?;
+    plan.write(&mut NoFields, &mut bytes)?;
     Ok(bytes.into())
 }
 

@@ -5,27 +5,27 @@ use std::sync::Arc;
 use bridge_core::{CallDescription, CallMap};
 use messages::{ActionCalls, ServiceType, TypeName};
 
+use crate::GraphError;
+
 /// Returns the service type under which a call is offered. The order is: the type in the mapping;
 /// the type that the executor names at the beginning of the description, as in `my_msgs/Weigh;
 /// Weighs the part`; a type of `std_srvs` with the same fields. `find` returns the type of a name.
 ///
 /// # Errors
-/// The reason why there is no type, as text for the user.
+/// The reason why there is no type.
 pub fn call_type(
     call: &CallDescription,
     (mapped, map): (Option<&TypeName>, &CallMap),
-    mut find: impl FnMut(&TypeName) -> Result<Arc<ServiceType>, String>,
-) -> Result<Arc<ServiceType>, String> {
+    mut find: impl FnMut(&TypeName) -> Result<Arc<ServiceType>, GraphError>,
+) -> Result<Arc<ServiceType>, GraphError> {
     if let Some(name) = mapped {
         let service_type = find(name)?;
-        call.fits(&service_type, map)
-            .map_err(|error| error.to_string())?;
+        call.fits(&service_type, map)?;
         return Ok(service_type);
     }
     if let Some(name) = named(call) {
         let service_type = find(&name)?;
-        call.fits(&service_type, map)
-            .map_err(|error| error.to_string())?;
+        call.fits(&service_type, map)?;
         return Ok(service_type);
     }
     let standard = match call.response.is_empty() {
@@ -44,12 +44,10 @@ pub fn call_type(
             let names: Vec<&str> = fields.iter().map(|field| field.name.as_str()).collect();
             names.join(", ")
         };
-        format!(
-            "its executor announces no service type, and no type of std_srvs has its fields: request ({}), \
-             response ({})",
-            of(&call.request),
-            of(&call.response)
-        )
+        GraphError::NoServiceType {
+            request: of(&call.request),
+            response: of(&call.response),
+        }
     })
 }
 
@@ -58,17 +56,16 @@ pub fn call_type(
 /// name.
 ///
 /// # Errors
-/// The reason why there is no type, as text for the user.
+/// The reason why there is no type.
 pub fn action_type(
     call: &CallDescription,
     (mapped, map): (Option<&TypeName>, &CallMap),
-    find: impl FnOnce(&TypeName) -> Result<Arc<ActionCalls>, String>,
-) -> Result<Arc<ActionCalls>, String> {
+    find: impl FnOnce(&TypeName) -> Result<Arc<ActionCalls>, GraphError>,
+) -> Result<Arc<ActionCalls>, GraphError> {
     let name = mapped.cloned().or_else(|| named(call));
-    let name = name.ok_or("its executor announces no action type")?;
+    let name = name.ok_or(GraphError::NoActionType)?;
     let calls = find(&name)?;
-    call.fits(calls.goal(), map)
-        .map_err(|error| error.to_string())?;
+    call.fits(calls.goal(), map)?;
     Ok(calls)
 }
 
@@ -110,9 +107,10 @@ mod tests {
     fn chosen(call: &CallDescription, mapped: Option<&str>) -> Result<String, String> {
         let registry = Registry::bundle(Dialect::Ros2);
         let mapped = mapped.map(|name| name.parse().unwrap());
-        let find = |name: &TypeName| registry.service(name).map_err(|error| error.to_string());
+        let find = |name: &TypeName| Ok(registry.service(name)?);
         call_type(call, (mapped.as_ref(), &CallMap::default()), find)
             .map(|found| found.name().to_string())
+            .map_err(|error| error.to_string())
     }
 
     #[test]

@@ -13,7 +13,7 @@ use super::super::{
     GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
 };
 use crate::services::{CallFault, ServiceCall};
-use crate::{Asker, CallGraph, ServiceGraph};
+use crate::{Asker, CallGraph, GraphError, ServiceGraph};
 
 /// The graph on either side. Requests to its servers and events for its clients go through
 /// channels.
@@ -55,17 +55,15 @@ impl ServiceGraph for Fake {
 
     const WIRE: Wire = Wire::Ros1;
 
-    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
-        self.registry
-            .service(name)
-            .map_err(|error| error.to_string())
+    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, GraphError> {
+        Ok(self.registry.service(name)?)
     }
 
-    fn carrier(&mut self, _: BuiltinType, _: bool) -> Result<Option<Arc<MessageType>>, String> {
+    fn carrier(&mut self, _: BuiltinType, _: bool) -> Result<Option<Arc<MessageType>>, GraphError> {
         Ok(None)
     }
 
-    fn client(&mut self, _: &str, _: &ServiceType, _: Duration) -> Result<Never, String> {
+    fn client(&mut self, _: &str, _: &ServiceType, _: Duration) -> Result<Never, GraphError> {
         Ok(Never)
     }
 }
@@ -75,7 +73,7 @@ impl CallGraph for Fake {
 
     const TELLS_FAULTS: bool = true;
 
-    fn offer(&mut self, _: &str, _: &Arc<ServiceType>, _: Asker) -> Result<(), String> {
+    fn offer(&mut self, _: &str, _: &Arc<ServiceType>, _: Asker) -> Result<(), GraphError> {
         Ok(())
     }
 }
@@ -84,23 +82,27 @@ impl ActionGraph for Fake {
     type Sender = Client;
     type Taker = Server;
 
-    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, String> {
-        let calls = self.registry.action_calls(name);
-        calls.map(Arc::new).map_err(|error| error.to_string())
+    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, GraphError> {
+        Ok(Arc::new(self.registry.action_calls(name)?))
     }
 
-    fn action_client(&mut self, _: &str, _: &TypeName, _: Waits) -> Result<Client, String> {
+    fn action_client(&mut self, _: &str, _: &TypeName, _: Waits) -> Result<Client, GraphError> {
         Ok(Client {
             sent: self.sent.clone(),
             cancels: self.cancels.clone(),
         })
     }
 
-    fn serve_action(&mut self, action: &str, _: &TypeName) -> Result<Server, String> {
+    fn serve_action(&mut self, action: &str, _: &TypeName) -> Result<Server, GraphError> {
         self.served.lock().unwrap().push(action.to_owned());
         Ok(Server {
             name: action.to_owned(),
-            events: self.events.lock().unwrap().take().ok_or("it is served")?,
+            events: self
+                .events
+                .lock()
+                .unwrap()
+                .take()
+                .ok_or(GraphError::GoalAnswered)?,
             served: Arc::clone(&self.served),
         })
     }
@@ -190,7 +192,7 @@ impl NewGoal for New {
         &self.body
     }
 
-    async fn accept(self) -> Result<Taken, String> {
+    async fn accept(self) -> Result<Taken, GraphError> {
         self.told.try_send(Told::Accepted).unwrap();
         Ok(Taken(self.told))
     }
@@ -205,13 +207,13 @@ pub(super) struct Taken(mpsc::Sender<Told>);
 impl ServedGoal for Taken {
     fn execute(&self) {}
 
-    fn feedback(&self, body: &[u8]) -> Result<(), String> {
+    fn feedback(&self, body: &[u8]) -> Result<(), GraphError> {
         let body = Bytes::copy_from_slice(body);
         self.0.try_send(Told::Feedback(body)).unwrap();
         Ok(())
     }
 
-    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), String> {
+    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), GraphError> {
         let result = result.map(Bytes::copy_from_slice);
         let ended = Told::Ended(status, message.to_owned(), result);
         self.0.try_send(ended).unwrap();
@@ -229,8 +231,8 @@ impl CancelRequest for Request {
         self.id
     }
 
-    fn accept(self) -> Result<(), String> {
-        self.agreed.send(true).map_err(|_| "gone".to_owned())
+    fn accept(self) -> Result<(), GraphError> {
+        self.agreed.send(true).map_err(|_| GraphError::GoalAnswered)
     }
 
     fn reject(self) {
