@@ -1,5 +1,7 @@
 //! The Local Discovery Server: a registry with an OPC UA endpoint, and mDNS on an interface.
 
+mod status;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::net::IpAddr;
 use std::path::PathBuf;
@@ -12,7 +14,6 @@ use opcua::types::ApplicationType;
 use plant_opcua::enrolment::{Applicant, DirectoryClient, Enrolment, Invitation};
 use plant_opcua::own;
 use registry::{Announcement, Asked, Event, Loss, NetworkRecord, Settings, instance_name};
-use serde::Serialize;
 use service::{Failure, FailureKind, Requests};
 use tokio::net::TcpListener;
 use tokio::sync::{mpsc, watch};
@@ -20,12 +21,14 @@ use tokio::task::{JoinSet, spawn_blocking};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{info, warn};
 
+pub use self::status::LdsStatus;
+use self::status::{LossStatus, RecordStatus, ServerStatus};
 use crate::clock;
 use crate::connection::{RegistryRequest, RequestCounters, ServerShared};
 use crate::endpoint;
 use crate::keeper::Keeper;
 use crate::listen::{cut, listen};
-use crate::listing::{ListingStatus, ListingTask, ServerQuery};
+use crate::listing::{ListingTask, ServerQuery};
 use crate::security::{ChannelSecurity, TOLD_EVERY};
 use crate::services::{OwnDescription, RegistryAnswer, RegistryQuery, semaphore};
 use mdns::Interface;
@@ -213,93 +216,6 @@ pub enum OnLevel {
         /// The URL.
         url: String,
     },
-}
-
-/// The status of a discovery server.
-#[derive(Debug, Clone, Serialize)]
-pub struct LdsStatus {
-    program: &'static str,
-    version: &'static str,
-    library: &'static str,
-    application_uri: String,
-    endpoint: String,
-    interface: String,
-    since_ms: u64,
-    not_ready: Vec<String>,
-    servers: Vec<ServerStatus>,
-    network: Vec<RecordStatus>,
-    losses: VecDeque<LossStatus>,
-    counters: BTreeMap<&'static str, u64>,
-    /// The Global Discovery Server whose servers are listed too.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    gds: Option<ListingStatus>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    level: Option<serde_json::Value>,
-    /// The certificate of the discovery server.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    certificate: Option<serde_json::Value>,
-}
-
-/// A registered server.
-#[derive(Debug, Clone, Serialize)]
-struct ServerStatus {
-    uri: String,
-    name: String,
-    urls: Vec<String>,
-    since_ms: u64,
-}
-
-/// A server that is announced on the network.
-#[derive(Debug, Clone, Serialize)]
-struct RecordStatus {
-    record_id: u32,
-    name: String,
-    url: String,
-    /// `registration`, `multicast`, or `gds` for a server that a Global Discovery Server lists.
-    source: &'static str,
-    capabilities: Vec<String>,
-    since_ms: u64,
-    /// The start time of its program, if known.
-    started_ms: Option<u64>,
-}
-
-/// A server that was lost.
-#[derive(Debug, Clone, Serialize)]
-struct LossStatus {
-    /// The ApplicationUri of a registered server, or the mDNS name of an announced server.
-    name: String,
-    url: String,
-    loss: &'static str,
-    at_ms: u64,
-    /// The time since its last answer, if it ever answered.
-    silent_ms: Option<u64>,
-}
-
-impl service::Told for LdsStatus {
-    fn json(&self) -> String {
-        // Serialization cannot fail: all keys are strings, and all numbers are finite.
-        serde_json::to_string(self).unwrap_or_default()
-    }
-
-    fn prometheus(&self) -> String {
-        let lines = self
-            .counters
-            .iter()
-            .map(|(name, count)| format!("ua_lds_{name} {count}\n"));
-        let sizes = [
-            ("registered", self.servers.len()),
-            ("on_network", self.network.len()),
-        ];
-        let sizes = sizes.map(|(name, size)| format!("ua_lds_{name} {size}\n"));
-        lines.chain(sizes).collect()
-    }
-
-    fn not_ready(&self) -> Vec<String> {
-        self.not_ready
-            .iter()
-            .map(|why| format!("{}: {why}\n", self.program))
-            .collect()
-    }
 }
 
 /// Runs a discovery server until `stop` completes.

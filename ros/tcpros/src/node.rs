@@ -1,6 +1,9 @@
 //! The node: its topics and services, and the tasks that serve it.
 
-use std::collections::HashMap;
+mod error;
+mod graph_reader;
+mod registry;
+
 use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicI32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -8,12 +11,15 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use socket2::{Domain, Socket, Type};
-use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
+pub use self::error::NodeError;
+pub use self::graph_reader::GraphReader;
+pub(crate) use self::registry::{Registration, ResourceKind};
+use self::registry::{Registry, Subscribed};
 use crate::crowd::Shares;
 use crate::events;
 use crate::inbox::Inbox;
@@ -284,10 +290,7 @@ impl Node {
 
     /// Returns a reader of the graph for another task, which may outlive the node.
     pub fn graph_reader(&self) -> GraphReader {
-        GraphReader {
-            master: self.inner.master.clone(),
-            last: None,
-        }
+        GraphReader::new(self.inner.master.clone())
     }
 
     /// Unregisters everything from the master and stops within two seconds. Connections to
@@ -318,31 +321,6 @@ impl Drop for Node {
     }
 }
 
-/// Reads the graph from the master of a node.
-#[derive(Clone, Debug)]
-pub struct GraphReader {
-    master: Master,
-    /// The last reply of the master, and its graph.
-    last: Option<(Bytes, Arc<Graph>)>,
-}
-
-impl GraphReader {
-    /// Returns the current graph of the master. Takes a few seconds at most; fails without a
-    /// master.
-    pub async fn read(&self) -> Result<Graph, MasterError> {
-        self.master.graph().await
-    }
-
-    /// Returns the current graph as [`read`](Self::read) does, and the same `Arc` as before if it
-    /// has not changed.
-    ///
-    /// # Errors
-    /// Fails without a master.
-    pub async fn read_again(&mut self) -> Result<Arc<Graph>, MasterError> {
-        self.master.graph_since(&mut self.last).await
-    }
-}
-
 /// State of the connection to the master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MasterState {
@@ -351,52 +329,6 @@ pub enum MasterState {
     /// The master replies, and was sent all registrations of that time. Refused registrations are
     /// logged and retried, and later registrations may still be on their way.
     Registered,
-}
-
-/// Error of starting a node, or of a topic or service.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum NodeError {
-    /// Called outside a tokio runtime.
-    #[error("a node needs a running tokio runtime")]
-    NoRuntime,
-    /// A name is not a valid ROS name.
-    #[error(transparent)]
-    Name(#[from] NameError),
-    /// The master's URI is not `http://host:port`.
-    #[error("the master's URI `{0}` is not of the form http://host:11311 (ROS_MASTER_URI)")]
-    MasterUri(String),
-    /// No port can be opened.
-    #[error("cannot listen on {address}: {source}")]
-    Listen {
-        /// The address.
-        address: IpAddr,
-        /// The error of the system.
-        #[source]
-        source: std::io::Error,
-    },
-    /// This node publishes the topic already.
-    #[error("{0} is already published by this node")]
-    AlreadyPublished(String),
-    /// The type has no package or no checksum.
-    #[error("{topic} cannot be published with the incomplete type `{type_name}`")]
-    Type {
-        /// The resolved topic.
-        topic: String,
-        /// The given type name.
-        type_name: String,
-    },
-    /// This node offers the service already.
-    #[error("{0} is already offered by this node")]
-    AlreadyOffered(String),
-    /// The type of the service has no package or no checksum.
-    #[error("{service} cannot be offered with the incomplete type `{type_name}`")]
-    ServiceType {
-        /// The resolved service.
-        service: String,
-        /// The given type name.
-        type_name: String,
-    },
 }
 
 /// State shared by the handles and tasks of the node.
@@ -429,49 +361,6 @@ pub(crate) struct Inner {
     /// Number of connections to subscribers and clients, including withdrawn topics and services.
     draining: watch::Sender<usize>,
     next_id: AtomicI32,
-}
-
-#[derive(Debug, Default)]
-struct Registry {
-    publications: HashMap<String, Arc<Hub>>,
-    subscriptions: HashMap<String, Subscribed>,
-    services: HashMap<String, Arc<Served>>,
-    generation: u64,
-    closed: bool,
-}
-
-impl Registry {
-    const fn next_generation(&mut self) -> u64 {
-        self.generation += 1;
-        self.generation
-    }
-}
-
-#[derive(Debug)]
-struct Subscribed {
-    generation: u64,
-    /// Number of received lists of publishers.
-    updates: u64,
-    /// The last received list of publishers.
-    publishers: Vec<String>,
-    feeds: Vec<Arc<Feed>>,
-}
-
-/// The registration of a topic or service, with its version.
-#[derive(Clone, Debug)]
-pub(crate) struct Registration {
-    pub(crate) name: String,
-    pub(crate) kind: ResourceKind,
-    pub(crate) generation: u64,
-    /// Type of a topic; empty for a service, because its type is not registered.
-    pub(crate) type_name: String,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(crate) enum ResourceKind {
-    Published,
-    Subscribed,
-    Service,
 }
 
 impl Inner {
@@ -802,63 +691,4 @@ const SHUTDOWN_LIMIT: Duration = Duration::from_secs(2);
 const BACKLOG: i32 = 1024;
 
 #[cfg(test)]
-mod tests {
-    use std::net::Ipv4Addr;
-
-    use super::*;
-
-    fn options() -> NodeOptions {
-        let mut options = NodeOptions::from_env("n");
-        // No server listens there.
-        "http://127.0.0.1:1".clone_into(&mut options.master_uri);
-        "/".clone_into(&mut options.namespace);
-        options.advertise_as("127.0.0.1");
-        options.bind = Ipv4Addr::LOCALHOST.into();
-        options
-    }
-
-    #[tokio::test]
-    async fn a_closed_node_does_not_begin_to_follow_the_simulated_clock() {
-        let node = Node::start(options()).unwrap();
-        node.inner.simulate(true);
-        assert_eq!(node.inner.wanted_registrations().len(), 1);
-        node.inner.simulate(false);
-        node.inner.close();
-        node.inner.simulate(true);
-        assert!(node.inner.wanted_registrations().is_empty());
-        assert!(lock(&node.inner.clock_feed).is_none());
-    }
-
-    #[tokio::test]
-    async fn the_answer_to_a_registration_does_not_replace_a_newer_list() {
-        let node = Node::start(options()).unwrap();
-        node.inner.simulate(true);
-        let list = |port: u16| vec![format!("http://127.0.0.1:{port}/")];
-        let known = || {
-            let registry = lock(&node.inner.registry);
-            registry.subscriptions["/clock"].publishers.clone()
-        };
-        let seen = node.inner.updates("/clock");
-        node.inner.publishers_changed("/clock", &list(2));
-        node.inner.registered_publishers("/clock", &list(3), seen);
-        assert_eq!(known(), list(2));
-        let seen = node.inner.updates("/clock");
-        node.inner.registered_publishers("/clock", &list(3), seen);
-        assert_eq!(known(), list(3));
-    }
-
-    #[test]
-    fn of_several_values_for_one_parameter_the_last_counts() {
-        let names = options().names().unwrap();
-        let given = [("rate", 5), ("gain", 1), ("rate", 6)];
-        let given = given.map(|(name, value)| (name.to_owned(), value.into()));
-        let params = params(&names, given.to_vec());
-        assert_eq!(
-            params.unwrap().given(),
-            [
-                ("/n/gain".to_owned(), 1.into()),
-                ("/n/rate".to_owned(), 6.into())
-            ]
-        );
-    }
-}
+mod tests;

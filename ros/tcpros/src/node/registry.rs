@@ -1,0 +1,53 @@
+//! The topics and services of a node.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use crate::publisher::Hub;
+use crate::service::Served;
+use crate::subscription::Feed;
+
+/// The topics and services of a node, by their resolved names.
+#[derive(Debug, Default)]
+pub(super) struct Registry {
+    pub(super) publications: HashMap<String, Arc<Hub>>,
+    pub(super) subscriptions: HashMap<String, Subscribed>,
+    pub(super) services: HashMap<String, Arc<Served>>,
+    pub(super) generation: u64,
+    pub(super) closed: bool,
+}
+
+impl Registry {
+    pub(super) const fn next_generation(&mut self) -> u64 {
+        self.generation += 1;
+        self.generation
+    }
+}
+
+/// A subscribed topic.
+#[derive(Debug)]
+pub(super) struct Subscribed {
+    pub(super) generation: u64,
+    /// Number of received lists of publishers.
+    pub(super) updates: u64,
+    /// The last received list of publishers.
+    pub(super) publishers: Vec<String>,
+    pub(super) feeds: Vec<Arc<Feed>>,
+}
+
+/// The registration of a topic or service, with its version.
+#[derive(Clone, Debug)]
+pub(crate) struct Registration {
+    pub(crate) name: String,
+    pub(crate) kind: ResourceKind,
+    pub(crate) generation: u64,
+    /// Type of a topic; empty for a service, because its type is not registered.
+    pub(crate) type_name: String,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) enum ResourceKind {
+    Published,
+    Subscribed,
+    Service,
+}
