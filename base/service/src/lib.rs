@@ -17,7 +17,7 @@ pub mod signals;
 
 pub use exit::{Failure, FailureKind};
 pub use hyper::StatusCode;
-pub use logging::LogFormat;
+pub use logging::{LogArguments, LogFormat};
 pub use pages::{
     Ask, BoxFuture, LiveAnswer, LivePage, PageBody, Pages, Requests, RunLoops, Secure, Site,
     Statuses, Stream, Told, Visit, full, loops, never, serve_pages, serve_secure,

@@ -30,6 +30,21 @@ pub enum LogFormat {
     Json,
 }
 
+/// The argument with the format of the log, for the arguments of a program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::Args)]
+#[group(skip)]
+pub struct LogArguments {
+    /// The format of the log
+    #[arg(
+        id = "log",
+        long = "log",
+        value_name = "FORMAT",
+        env = "UA_LOG_FORMAT",
+        default_value = "text"
+    )]
+    pub format: LogFormat,
+}
+
 /// Starts logging. `UA_LOG` sets levels, such as `debug` or `info,bridge_core=trace`. `quiet` holds
 /// directives that suppress noisy messages of a library.
 pub fn start(format: LogFormat, quiet: &str) {

@@ -25,7 +25,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use ::service::{Failure, FailureKind, LogFormat, Service, run_service};
+use ::service::{Failure, FailureKind, LogArguments, LogFormat, Service, run_service};
 use discovery::Interface;
 use plant_opcua::pki::default_root;
 use plant_opcua::server::EndpointUrl;
@@ -68,14 +68,8 @@ struct UaGds {
     /// The network interface for mDNS announcements, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     interface: Option<String>,
-    /// The format of the log
-    #[arg(
-        long,
-        value_name = "FORMAT",
-        env = "UA_LOG_FORMAT",
-        default_value = "text"
-    )]
-    log: LogFormat,
+    #[command(flatten)]
+    log: LogArguments,
 }
 
 #[derive(Debug, clap::Subcommand)]
@@ -120,7 +114,7 @@ impl Service for UaGds {
     const QUIET: &'static str = plant_opcua::QUIET;
 
     fn log(&self) -> LogFormat {
-        self.log
+        self.log.format
     }
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {

@@ -15,7 +15,7 @@ use plant_opcua::pki::default_named;
 use plant_opcua::server::EndpointUrl;
 use plant_opcua::users::{Role, Roles};
 use registry::hierarchy::{Choice, Place};
-use service::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
+use service::{Failure, FailureKind, LogArguments, LogFormat, Service, run_service, serve_pages};
 
 use crate::{StationSettings, Upper};
 
@@ -105,14 +105,8 @@ struct UaStation {
     /// Serve the status at this address: /status as JSON, /metrics for Prometheus, and /readyz
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     metrics: Option<SocketAddr>,
-    /// The format of the log
-    #[arg(
-        long,
-        value_name = "FORMAT",
-        env = "UA_LOG_FORMAT",
-        default_value = "text"
-    )]
-    log: LogFormat,
+    #[command(flatten)]
+    log: LogArguments,
 }
 
 /// Runs `ua-station` with the command line `arguments`, which start with the name of the program,
@@ -127,7 +121,7 @@ impl Service for UaStation {
         opcua_core=off,opcua_crypto=off,opcua_nodes=warn,opcua_types=off,mdns_sd=off";
 
     fn log(&self) -> LogFormat {
-        self.log
+        self.log.format
     }
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {

@@ -75,11 +75,11 @@ pub(crate) fn run(arguments: Vec<OsString>) -> ExitCode {
     } = &cell.arguments;
     if *check {
         let nodesets = Some(ua_server::NODESETS);
-        return bridge_node::check_mapping(mapping.as_deref(), nodesets, flags.log);
+        return bridge_node::check_mapping(mapping.as_deref(), nodesets, flags.log.format);
     }
     let programs = match cell.threads() {
         Ok(threads) => ProgramSet {
-            log: flags.log,
+            log: flags.log.format,
             metrics: flags.metrics,
             mapping: mapping.clone(),
             threads,

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use plant_opcua::enrolment::GdsArguments;
 use plant_opcua::pki::default_named;
-use service::{Failure, FailureKind, LogFormat, Service, run_service, serve_pages};
+use service::{Failure, FailureKind, LogArguments, LogFormat, Service, run_service, serve_pages};
 
 use crate::lds::{self, LdsSettings};
 use crate::listing::ListingArguments;
@@ -65,14 +65,8 @@ struct UaLds {
     /// readiness
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     metrics: Option<SocketAddr>,
-    /// The format of the log
-    #[arg(
-        long,
-        value_name = "FORMAT",
-        env = "UA_LOG_FORMAT",
-        default_value = "text"
-    )]
-    log: LogFormat,
+    #[command(flatten)]
+    log: LogArguments,
 }
 
 /// Runs `ua-lds` with the command line `arguments`, which begin with the name of the program.
@@ -86,7 +80,7 @@ impl Service for UaLds {
     const QUIET: &'static str = "opcua_core=off,opcua_crypto=off,opcua_types=off,mdns_sd=off";
 
     fn log(&self) -> LogFormat {
-        self.log
+        self.log.format
     }
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {

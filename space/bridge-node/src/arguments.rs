@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::FromArgMatches;
-use service::LogFormat;
+use service::LogArguments;
 
 /// Flags take precedence over `UA_*` environment variables, which take precedence over the mapping.
 #[derive(Debug, Clone, clap::Args)]
@@ -40,14 +40,9 @@ pub struct Flags {
     /// the program's configuration
     #[arg(long, value_name = "MAPPING", env = "UA_SECURITY")]
     pub security: Option<PathBuf>,
-    /// The format of the log
-    #[arg(
-        long,
-        value_name = "FORMAT",
-        env = "UA_LOG_FORMAT",
-        default_value = "text"
-    )]
-    pub log: LogFormat,
+    /// The format of the log.
+    #[command(flatten)]
+    pub log: LogArguments,
     /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON, and
     /// /readyz for readiness
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]

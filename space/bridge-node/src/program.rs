@@ -190,7 +190,7 @@ pub fn run<P: Program>(arguments: impl IntoIterator<Item = OsString>) -> ExitCod
         Ok(program) => program,
         Err(code) => return code,
     };
-    logging::start(program.arguments().flags.log, P::QUIET);
+    logging::start(program.arguments().flags.log.format, P::QUIET);
     descriptors::raise();
     let ended = match open(&program) {
         Ok(Some(mapping)) => serve(program, mapping),
