@@ -1,70 +1,33 @@
 //! The task that owns a skill. It processes calls and the end of the work sequentially.
 
-use std::any::Any;
+mod history;
+mod order;
+mod refused;
+mod work;
+
 use std::collections::VecDeque;
-use std::fmt;
-use std::future::pending;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime};
 
 use log_limit::LogLimit;
-use program::{Ending, Method, Nature, Program, Refused, RunId, State, Transition};
-use tokio::sync::{mpsc, oneshot, watch};
-use tokio::task::{JoinError, JoinHandle};
+use program::{Ending, Method, Nature, Program, RunId, State, Transition};
+use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
+use self::history::History;
+pub(crate) use self::order::{Call, Given, Order, Successor};
+use self::refused::{not_now, refusal, still_at_work, unknown_outcome};
+use self::work::{
+    Halting, Happened, RunFailure, Running, Started, Stop, Then, happens, outcome_of,
+};
 use crate::authority::{Authority, Owner};
-use crate::driver::{Driver, Line, Reins, Results, Signal, Work};
+use crate::driver::{Driver, Line, Results, Signal, Work};
 use crate::driver_error::DriverError;
 use crate::parameters::Parameters;
 use crate::refusal::{Code, Refusal};
-use crate::shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
+use crate::shown::{LastCall, Observer, Outcome, Shown, Told, Transitioned};
 use crate::skill::{Facts, Pending, lock};
-use crate::value::Value;
-
-/// A message to the task.
-#[derive(Debug)]
-pub(crate) enum Order {
-    Call(Call),
-    /// Closes the component: a run in progress is halted, regardless of the holder of the lease.
-    Close(oneshot::Sender<()>),
-}
-
-/// A call of a method, waiting for the task.
-#[derive(Debug)]
-pub(crate) struct Call {
-    pub(crate) by: Owner,
-    pub(crate) method: Method,
-    pub(crate) given: Given,
-    pub(crate) reply: oneshot::Sender<Result<u32, Refusal>>,
-}
-
-/// The arguments of a Start call.
-#[derive(Debug, Default)]
-pub(crate) struct Given {
-    /// The parameters; `None` uses the parameters that the caller wrote before.
-    pub(crate) parameters: Option<Vec<(String, Value)>>,
-    /// Time limit of the run. It applies if it is shorter than the limit of the skill.
-    pub(crate) within: Option<Duration>,
-    /// Whether a Halted skill is reset first.
-    pub(crate) readies: bool,
-}
-
-/// The driver and the time limit of the next runs.
-pub(crate) struct Successor {
-    pub(crate) driver: Arc<dyn Driver>,
-    pub(crate) timeout: Option<Duration>,
-}
-
-impl fmt::Debug for Successor {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut shown = f.debug_struct("Successor");
-        shown
-            .field("timeout", &self.timeout)
-            .finish_non_exhaustive()
-    }
-}
 
 pub(crate) struct Actor {
     facts: Arc<Facts>,
@@ -74,56 +37,15 @@ pub(crate) struct Actor {
     successor: Arc<Mutex<Option<Successor>>>,
     authority: Authority,
     pending: Arc<Mutex<Pending>>,
-    outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
+    history: History,
     observers: Vec<Box<dyn Observer>>,
     program: Program,
     shown: watch::Sender<Arc<Shown>>,
     now: Shown,
     work: Option<Running>,
-    /// Trace lines of the current run.
-    trace: Vec<String>,
     /// Rate limit of log messages about refused calls, so that a client that retries in a loop
     /// cannot flood the log.
     refusals: LogLimit,
-}
-
-/// The work of a run, kept until the work has ended.
-struct Running {
-    run: RunId,
-    task: JoinHandle<Result<Results, DriverError>>,
-    reins: Reins,
-    /// Time limit of the run.
-    within: Option<Duration>,
-    began: Instant,
-    /// Time at which the run times out, while it is Running and has a limit.
-    deadline: Option<Instant>,
-    /// Remaining time of the run, measured when it was suspended.
-    left: Option<Duration>,
-    /// Result of work that ended while the run was suspended. It is applied when the run is
-    /// resumed.
-    ended: Option<Result<Results, RunFailure>>,
-    /// Set after a stop request to work that is done elsewhere, until that work ends.
-    halting: Option<Halting>,
-    /// Reason why the end of the work is unknown. The end may never become known.
-    unknown: Option<String>,
-}
-
-/// State of a run that is done elsewhere between the stop request and the end of its work.
-struct Halting {
-    /// Reason of the stop, as text for the outcome.
-    message: String,
-    then: Then,
-    /// From this time on, a second Halt ends the run with an unknown outcome.
-    over: Instant,
-}
-
-/// The transition after the end of a stopped run.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Then {
-    /// To Halted, regardless of the result.
-    Halt,
-    /// The usual transition at the end of a run. The run fails if its work is not done.
-    End,
 }
 
 type Store = (Arc<Mutex<Pending>>, Arc<Mutex<VecDeque<Arc<Outcome>>>>);
@@ -141,24 +63,7 @@ impl Actor {
             rests_in: facts.rests_in,
         };
         let program = Program::counting_from(nature, first_run);
-        let created = clock();
-        let now = Shown {
-            state: program.state(),
-            last: None,
-            since: created,
-            run: 0,
-            progress: 0.0,
-            step: String::new(),
-            parameters: Arc::default(),
-            outcome: None,
-            pending: None,
-            needs_reset: false,
-            diagnostic: Diagnostic {
-                created,
-                last_call: None,
-            },
-            executable: Method::ALL.map(|method| program.is_executable(method)),
-        };
+        let now = Shown::first(&program, clock());
         let (shown, watched) = watch::channel(Arc::new(now.clone()));
         let actor = Self {
             timeout: facts.timeout,
@@ -167,13 +72,12 @@ impl Actor {
             successor,
             authority,
             pending,
-            outcomes,
+            history: History::new(outcomes),
             observers,
             program,
             shown,
             now,
             work: None,
-            trace: Vec::new(),
             refusals: LogLimit::every(TOLD_EVERY),
         };
         (actor, watched)
@@ -288,19 +192,13 @@ impl Actor {
                 self.take(Method::Suspend, &format!("suspended by {by}"))?;
                 self.signal(Signal::StandStill);
                 if let Some(work) = &mut self.work {
-                    let deadline = work.deadline.take();
-                    work.left =
-                        deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
+                    work.suspend();
                 }
             }
             Method::Resume => {
                 self.take(Method::Resume, &format!("resumed by {by}"))?;
                 self.signal(Signal::Go);
-                if let Some(work) = &mut self.work {
-                    work.deadline = work.left.take().map(|left| Instant::now() + left);
-                }
-                let ended = self.work.as_mut().and_then(|work| work.ended.take());
-                if let Some(result) = ended {
+                if let Some(result) = self.work.as_mut().and_then(Running::resume) {
                     self.settle(result);
                 }
             }
@@ -328,7 +226,7 @@ impl Actor {
         self.authority.begin(&self.facts.name)?;
         let begun = self.begin(by, is_halted).await;
         let (transition, run) = begun.inspect_err(|_| self.authority.end(&self.facts.name))?;
-        self.trace.clear();
+        self.history.clear_trace();
         // The configuration may differ at the next run.
         lock(&self.pending).kept(by, &given);
         self.now.parameters = Arc::new(parameters.clone());
@@ -343,19 +241,8 @@ impl Actor {
         // The work starts after the transition is published, so that observers see the start of a
         // run before its end, even if the driver finishes immediately.
         let (work, reins) = Work::new(run.number(), parameters);
-        let driver = Arc::clone(&self.driver);
-        self.work = Some(Running {
-            run,
-            task: tokio::spawn(async move { driver.run(work).await }),
-            reins,
-            within,
-            began: Instant::now(),
-            deadline: within.map(|within| Instant::now() + within),
-            left: None,
-            ended: None,
-            halting: None,
-            unknown: None,
-        });
+        let started = Started { run, work, reins };
+        self.work = Some(Running::new(started, Arc::clone(&self.driver), within));
         Ok(())
     }
 
@@ -664,8 +551,8 @@ impl Actor {
             } else {
                 message.clone()
             },
-            results: self.in_order(result.unwrap_or_default()),
-            trace: std::mem::take(&mut self.trace),
+            results: self.facts.in_order(result.unwrap_or_default()),
+            trace: self.history.take_trace(),
         };
         self.keep(outcome);
         match self.program.ended(run, ending) {
@@ -695,38 +582,15 @@ impl Actor {
             unknown: self.now.needs_reset,
             message,
             results: Vec::new(),
-            trace: std::mem::take(&mut self.trace),
+            trace: self.history.take_trace(),
         };
         self.keep(outcome);
     }
 
     fn keep(&mut self, outcome: Outcome) {
-        let outcome = Arc::new(outcome);
-        let mut outcomes = lock(&self.outcomes);
-        if outcomes.len() >= MOST_OUTCOMES {
-            outcomes.pop_front();
-        }
-        outcomes.push_back(Arc::clone(&outcome));
-        drop(outcomes);
+        let outcome = self.history.keep(outcome);
         self.now.outcome = Some(Arc::clone(&outcome));
         self.tell(Told::Outcome(&outcome));
-    }
-
-    /// Returns the results that the type declares, in the order of the type.
-    fn in_order(&self, results: Results) -> Results {
-        let mut ordered = Vec::new();
-        for declared in &self.facts.results {
-            let found = results.iter().find(|(name, _)| *name == declared.name);
-            let fits = found.and_then(|(_, value)| declared.shape.take(value.clone()));
-            match fits {
-                Some(value) => ordered.push((declared.name.clone(), value)),
-                None => debug!(
-                    skill = self.facts.name,
-                    "the driver gave no {}", declared.name
-                ),
-            }
-        }
-        ordered
     }
 
     fn take(&mut self, method: Method, message: &str) -> Result<(), Refusal> {
@@ -763,19 +627,8 @@ impl Actor {
     }
 
     fn line(&mut self, line: Line) {
-        let text = match &line {
-            Line::Step(text)
-            | Line::Note(text)
-            | Line::Pending(text)
-            | Line::Refused(text)
-            | Line::Unknown(text) => text,
-        };
-        if let Some(work) = &self.work
-            && self.trace.len() < MOST_TRACED
-        {
-            let text: String = text.chars().take(LONGEST_TRACED).collect();
-            let seconds = work.began.elapsed().as_secs_f64();
-            self.trace.push(format!("{seconds:.3} {text}"));
+        if let Some(work) = &self.work {
+            self.history.add(work.began, &line);
         }
         match line {
             Line::Step(step) => {
@@ -809,13 +662,7 @@ impl Actor {
 
     /// Processes steps that were reported before the work ended.
     fn take_steps(&mut self) {
-        let mut lines = Vec::new();
-        if let Some(work) = &mut self.work {
-            while let Ok(line) = work.reins.steps.try_recv() {
-                lines.push(line);
-            }
-        }
-        for line in lines {
+        while let Some(line) = self.work.as_mut().and_then(Running::report) {
             self.line(line);
         }
     }
@@ -834,121 +681,6 @@ impl Actor {
     }
 }
 
-enum Happened {
-    Call(Call),
-    Line(Line),
-    Progress(f32),
-    Ended(Result<Results, RunFailure>),
-    Late,
-}
-
-/// The reaction of work to a stop request.
-enum Stop {
-    /// The work finished.
-    Done(Results),
-    /// The work stopped.
-    Stopped,
-    /// The work ended with a reason, or did not stop and was aborted.
-    BrokenOff(String),
-    /// The work is done elsewhere, and its end is not known yet.
-    Pending,
-    /// The executor of the work refuses to cancel it.
-    Refused(String),
-}
-
-/// The reason why a run has no results.
-#[derive(Debug, thiserror::Error)]
-enum RunFailure {
-    #[error(transparent)]
-    Driver(#[from] DriverError),
-    /// The driver panicked and has not stopped its machine.
-    #[error("the driver broke down: {panic}; the outcome is unknown, check the machine")]
-    Panicked { panic: String },
-    /// The task of the driver was aborted.
-    #[error("the work was broken off; the outcome is unknown, check the machine")]
-    Aborted,
-    /// The run was stopped, and its work gave this reason.
-    #[error("{message}; {why}")]
-    AfterStop { message: String, why: Box<Self> },
-    /// The run was stopped, and its work had nothing to add.
-    #[error("{0}")]
-    Stopped(String),
-}
-
-impl RunFailure {
-    /// Returns the failure of a run that was stopped with this message.
-    fn after(self, message: String) -> Self {
-        match self {
-            Self::Driver(DriverError::Stopped) => Self::Stopped(message),
-            why @ (Self::Driver(_)
-            | Self::Panicked { .. }
-            | Self::Aborted
-            | Self::AfterStop { .. }
-            | Self::Stopped(_)) => Self::AfterStop {
-                message,
-                why: Box::new(why),
-            },
-        }
-    }
-}
-
-/// Returns the next event of the work. Pends while there is no work.
-async fn happens(work: &mut Option<Running>) -> Happened {
-    let Some(Running {
-        task,
-        reins,
-        deadline,
-        ended,
-        unknown,
-        ..
-    }) = work
-    else {
-        return pending().await;
-    };
-    if ended.is_some() {
-        return pending().await;
-    }
-    let late = async {
-        match deadline {
-            Some(deadline) => sleep_until(*deadline).await,
-            None => pending().await,
-        }
-    };
-    tokio::select! {
-        biased;
-        Some(line) = reins.steps.recv() => Happened::Line(line),
-        ended = task => Happened::Ended(outcome_of(ended, unknown)),
-        Ok(()) = reins.progress.changed() => Happened::Progress(*reins.progress.borrow_and_update()),
-        () = late => Happened::Late,
-    }
-}
-
-/// Returns the result of ended work. A driver that panicked has not stopped its machine: `unknown`
-/// then receives the reason.
-fn outcome_of(
-    ended: Result<Result<Results, DriverError>, JoinError>,
-    unknown: &mut Option<String>,
-) -> Result<Results, RunFailure> {
-    let error = match ended {
-        Ok(result) => return result.map_err(RunFailure::Driver),
-        Err(error) => error,
-    };
-    let why = match error.try_into_panic() {
-        Ok(panic) => RunFailure::Panicked {
-            panic: text_of(&*panic).to_owned(),
-        },
-        Err(_) => RunFailure::Aborted,
-    };
-    unknown.get_or_insert_with(|| why.to_string());
-    Err(why)
-}
-
-fn text_of(panic: &(dyn Any + Send)) -> &str {
-    let text = panic.downcast_ref::<String>().map(String::as_str);
-    text.or_else(|| panic.downcast_ref::<&str>().copied())
-        .unwrap_or("no reason given")
-}
-
 #[expect(
     clippy::disallowed_methods,
     reason = "when a machine did something is told by the clock of its host"
@@ -957,39 +689,11 @@ fn clock() -> SystemTime {
     SystemTime::now()
 }
 
-fn not_now(method: Method, state: State) -> Refusal {
-    refusal(Refused::State { method, state })
-}
-
-fn refusal(refused: Refused) -> Refusal {
-    let code = if refused == Refused::CannotSuspend {
-        Code::NotSupported
-    } else {
-        Code::InvalidState
-    };
-    Refusal::new(code, refused.to_string())
-}
-
-fn unknown_outcome(run: u32) -> Refusal {
-    let text = format!("the outcome of run {run} is unknown; Reset makes the skill ready");
-    Refusal::new(Code::InvalidState, text)
-}
-
-fn still_at_work(run: RunId) -> Refusal {
-    let text = format!("the work of run {} has not come to an end", run.number());
-    Refusal::new(Code::InvalidState, text)
-}
-
 /// Time that the work has to end after it was stopped.
 const TIME_TO_STOP: Duration = Duration::from_secs(1);
 /// Time that the aborted future has to be dropped; a future that blocks its thread takes longer.
 const TIME_TO_BREAK_OFF: Duration = Duration::from_millis(100);
-/// Maximum number of trace lines of a run, and the maximum length of each in characters.
-const MOST_TRACED: usize = 256;
-const LONGEST_TRACED: usize = 240;
 /// Interval in which one refused call of a skill is logged, with the number of suppressed messages.
 const TOLD_EVERY: Duration = Duration::from_secs(1);
 /// Time that a closing component waits for the end of work that it has cancelled elsewhere.
 const PENDING_AT_END: Duration = Duration::from_millis(4_500);
-/// Number of outcomes that are kept.
-const MOST_OUTCOMES: usize = 64;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use program::{Method, State, Transition};
+use program::{Method, Program, State, Transition};
 
 use crate::authority::Owner;
 use crate::parameters::Parameters;
@@ -37,6 +37,29 @@ pub struct Shown {
     pub needs_reset: bool,
     /// For each of [`Method::ALL`], whether a call is possible in this state.
     pub executable: [bool; 5],
+}
+
+impl Shown {
+    /// Returns the snapshot of a skill that was created at this time and has had no run.
+    pub(crate) fn first(program: &Program, created: SystemTime) -> Self {
+        Self {
+            state: program.state(),
+            last: None,
+            since: created,
+            run: 0,
+            progress: 0.0,
+            step: String::new(),
+            parameters: Arc::default(),
+            outcome: None,
+            diagnostic: Diagnostic {
+                created,
+                last_call: None,
+            },
+            pending: None,
+            needs_reset: false,
+            executable: Method::ALL.map(|method| program.is_executable(method)),
+        }
+    }
 }
 
 /// The end of a run.

@@ -6,10 +6,11 @@ use std::time::Duration;
 
 use program::{Method, Rest, State};
 use tokio::sync::{mpsc, oneshot, watch};
+use tracing::debug;
 
 use crate::actor::{Actor, Call, Given, Order, Successor};
 use crate::authority::{Authority, Owner};
-use crate::driver::Driver;
+use crate::driver::{Driver, Results};
 use crate::parameters::{Parameter, Parameters, TypeName, shortened};
 use crate::refusal::{Code, Refusal};
 use crate::shown::{Observer, Outcome, Shown};
@@ -32,6 +33,22 @@ pub struct Facts {
     pub timeout: Option<Duration>,
     /// The state after a successful run, as its type defines it.
     pub rests_in: Rest,
+}
+
+impl Facts {
+    /// Returns the results that the type declares, in the order of the type.
+    pub(crate) fn in_order(&self, results: Results) -> Results {
+        let mut ordered = Vec::new();
+        for declared in &self.results {
+            let found = results.iter().find(|(name, _)| *name == declared.name);
+            let fits = found.and_then(|(_, value)| declared.shape.take(value.clone()));
+            match fits {
+                Some(value) => ordered.push((declared.name.clone(), value)),
+                None => debug!(skill = self.name, "the driver gave no {}", declared.name),
+            }
+        }
+        ordered
+    }
 }
 
 /// A skill that is executed in this process. Clones share the skill. It ends when the last clone is
