@@ -1,8 +1,8 @@
 //! The places of running queries.
 //!
-//! Named questions, updates and plans have places of their own. Any other query starts in a quick place; a
-//! query that holds it for too long moves to a long place, or is stopped if there is none. Each
-//! client has a share of the long places. The text of a long query is remembered, so that its
+//! Named questions, updates and plans have places of their own. Any other query starts in a quick
+//! place; a query that holds it for too long moves to a long place, or is stopped if there is none.
+//! Each client has a share of the long places. The text of a long query is remembered, so that its
 //! repetitions do not take quick places.
 
 use std::collections::{BTreeMap, VecDeque};
