@@ -3,8 +3,8 @@
 use std::io::{self, Write as _};
 use std::path::Path;
 
-use http_client::encoded;
 use serde::Deserialize;
+use uri_text::escaped;
 
 use crate::arguments::{MesAt, Source, SourceAt, SourceVerb};
 use crate::ask::refusal;
@@ -39,7 +39,7 @@ pub(crate) fn source(arguments: &Source) -> Result<(), Failure> {
                 Some(name) => name.clone(),
                 None => plain_name(file)?,
             };
-            let path = format!("/sources/{}/{}", encoded(&kind), encoded(&name));
+            let path = format!("/sources/{}/{}", escaped(&kind), escaped(&name));
             let done = change("PUT", &path, ("application/octet-stream", contents), at)?;
             let verb = if done.status == CREATED {
                 "added"
@@ -49,7 +49,7 @@ pub(crate) fn source(arguments: &Source) -> Result<(), Failure> {
             say(&format!("{kind} {name}: {verb}"))
         }
         SourceVerb::Remove { kind, name, at } => {
-            let path = format!("/sources/{}/{}", encoded(kind), encoded(name));
+            let path = format!("/sources/{}/{}", escaped(kind), escaped(name));
             change("DELETE", &path, ("", Vec::new()), at)?;
             say(&format!("{kind} {name}: removed"))
         }
