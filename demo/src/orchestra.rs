@@ -283,7 +283,7 @@ impl Director<'_> {
                         return Ok(Some(stamped.event));
                     }
                     Some(Report::Garbled { name, line }) => {
-                        self.note(format!("{name} says what is no event: {line}"));
+                        self.note(format!("{name} printed a line that is no event: {line}"));
                     }
                     Some(Report::Ended { name, status }) => {
                         let last_lines = self.programs.last_lines(name);

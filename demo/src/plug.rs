@@ -443,7 +443,7 @@ impl Director<'_> {
                         return Ok(Next::Told(told.event));
                     }
                     Some(Report::Garbled { name, line }) => {
-                        self.note(format!("{name} says what is no event: {line}"));
+                        self.note(format!("{name} printed a line that is no event: {line}"));
                     }
                     Some(Report::Killed { name, at_ns }) => {
                         if let Some(part) = Part::of_name(name) {

@@ -117,7 +117,7 @@ impl Show {
         let seconds = |at_ns: i64| Some(millis(at_ns - began_at) / 1e3);
         if let Err(error) = timeline.print_all(&seconds) {
             // The exit code reports it at the end.
-            tracing::debug!(%error, "nobody reads");
+            tracing::debug!(%error, "cannot print an event: its reader has closed");
         }
     }
 
@@ -241,7 +241,7 @@ impl Watcher<'_> {
                     Some(Told::Ended { name, status }) => return (name, status),
                     Some(Told::Told(stamped)) => self.heard(&stamped.event, stamped.at_ns),
                     Some(Told::Garbled { name, line }) => {
-                        self.show.note(Who::DEMO, format!("{name} says what is no event: {line}"));
+                        self.show.note(Who::DEMO, format!("{name} printed a line that is no event: {line}"));
                     }
                     Some(Told::Killed { name, at_ns }) if name == BELT_NODE => {
                         self.see(MachineEvent::Belt { runs: false }, at_ns);

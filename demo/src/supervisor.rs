@@ -213,7 +213,7 @@ impl Switch {
                 Ok(result) => problem = result.status_code.to_string(),
                 Err(error) => problem = error.to_string(),
             }
-            tracing::warn!(problem, "the conveyor was not switched");
+            tracing::warn!(problem, "cannot switch the conveyor");
             sleep(LOOK_AGAIN).await;
         }
         Err(anyhow!("{problem}")).context("Conveyor.Switch of the OPC UA server was not executed")
@@ -244,7 +244,7 @@ async fn object_of(session: &Session, method: &NodeId) -> anyhow::Result<Option<
     let results = session
         .browse(&[description], 1, None)
         .await
-        .map_err(|error| anyhow!("the OPC UA server does not say what it has: {error}"))?;
+        .map_err(|error| anyhow!("cannot browse the OPC UA server: {error}"))?;
     let references = results.into_iter().next();
     let references = references.and_then(|result| result.references);
     let object = references.and_then(|references| references.into_iter().next());
@@ -279,7 +279,7 @@ impl Watch {
     fn see(&mut self, name: Name, data: &DataValue) -> anyhow::Result<()> {
         let status = data.status.unwrap_or(StatusCode::Good);
         if !status.is_good() {
-            tracing::info!(%name, %status, "no good value");
+            tracing::info!(%name, %status, "received a value that is not Good");
             if !self.complete() {
                 tell(SupervisorEvent::Awaits {
                     names: self.missing(),

@@ -219,7 +219,7 @@ impl Story<'_> {
     async fn count_robots(&mut self) -> Result<(), Stop> {
         let page: Json = fetch(self.page)
             .await
-            .map_err(|error| Stop::Broken(format!("ua-lds does not tell who is there: {error}")))?;
+            .map_err(|error| Stop::Broken(format!("cannot list the servers of ua-lds: {error}")))?;
         let servers = page.get("servers").and_then(Json::as_array);
         let robots = ["urn:example:ur5", "urn:example:robot"];
         self.report.robots = servers

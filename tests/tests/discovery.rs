@@ -449,7 +449,7 @@ fn the_cells_server_is_found_and_shows_who_is_there() {
         status["servers"][0]["uri"].as_str().map(str::to_owned)
     });
     let gripper = announced("gripper", &[]);
-    server.wait_for_line("a server is seen", SOON);
+    server.wait_for_line("discovered a server", SOON);
     // Both programs discover for themselves.
     let gripper_there = eventually("its discovery server sees it", SOON, || {
         on_network("gripper")

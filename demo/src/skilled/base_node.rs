@@ -101,8 +101,8 @@ async fn answer(server: &Server, goal: ExecutingGoalHandle<Goal>, reached: Reach
     let told = server.send_result_response(goal, GoalEndStatus::Succeeded, reached);
     match timeout(RESULT_WITHIN, told).await {
         Ok(Ok(())) => {}
-        Ok(Err(error)) => tracing::warn!(?error, "a result was not told"),
-        Err(_) => tracing::warn!("nobody asks for the result"),
+        Ok(Err(error)) => tracing::warn!(?error, "cannot send a result"),
+        Err(_) => tracing::warn!("the result was not requested in time"),
     }
 }
 

@@ -40,7 +40,7 @@ async fn request<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
 /// The reason why a page is not available.
 #[derive(Debug, Error)]
 pub(crate) enum PageError {
-    #[error("nobody listens there: {0}")]
+    #[error("cannot connect: {0}")]
     Connect(#[source] std::io::Error),
     #[error("HTTP failed: {0}")]
     Http(#[from] HttpError),

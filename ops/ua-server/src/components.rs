@@ -121,13 +121,13 @@ fn log(found: &Found) {
             name = ?known.name,
             url = known.url,
             uri = known.application_uri,
-            "a server is seen"
+            "discovered a server"
         ),
         Found::Gone { known, loss } => info!(
             name = ?known.name,
             url = known.url,
             loss = loss.label(),
-            "a server is gone"
+            "lost a server"
         ),
     }
 }

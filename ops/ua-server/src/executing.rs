@@ -312,7 +312,7 @@ async fn call(
         Err(error) => not_answered(error),
     };
     if let Err(error) = called {
-        info!(topic = %wanted.topic, url = %wanted.target.access.endpoint, ?outcome, "a Method came to nothing: {error}");
+        info!(topic = %wanted.topic, url = %wanted.target.access.endpoint, ?outcome, "cannot call a Method of another server: {error}");
     }
     outcome
 }

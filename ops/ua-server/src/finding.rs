@@ -335,7 +335,7 @@ impl Finding {
             info!(
                 server = placed.name,
                 url = %placed.access.endpoint,
-                "a server that was found is there no longer"
+                "lost a server whose skills were shown"
             );
         }
         self.placed = now;

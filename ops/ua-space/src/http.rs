@@ -145,7 +145,7 @@ impl Server {
     ) -> Result<Answer, String> {
         let stream = TcpStream::connect(&self.authority)
             .await
-            .map_err(|error| format!("nobody listens there ({error})"))?;
+            .map_err(|error| format!("cannot connect to {} ({error})", self.authority))?;
         let is_protobuf = content_type == PROTOBUF;
         let mut request = Request::builder()
             .method(method)

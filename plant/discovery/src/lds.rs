@@ -444,8 +444,8 @@ impl Lds {
                     Err(fault) => {
                         let (uri, why) = (cut(&uri), cut(&fault.to_string()));
                         let what = format!("{uri} {why}");
-                        if let Some(untold) = self.refused.admit(&what, clock::now()) {
-                            warn!(?uri, untold, "refused a registration: {why}");
+                        if let Some(suppressed) = self.refused.admit(&what, clock::now()) {
+                            warn!(?uri, suppressed, "refused a registration: {why}");
                         }
                         RegistryAnswer::Refused(fault.status())
                     }

@@ -98,8 +98,8 @@ impl ChannelSecurity {
             return Ok(());
         };
         let told = refused.to_string();
-        if let Some(untold) = self.refused.lock().admit(&told, clock::now()) {
-            warn!(untold, "rejected a client: {told}");
+        if let Some(suppressed) = self.refused.lock().admit(&told, clock::now()) {
+            warn!(suppressed, "rejected a client: {told}");
         }
         // An untrusted client does not learn which check failed (OPC 10000-4, 6.1.3).
         if refused.may_be_told {

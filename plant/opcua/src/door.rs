@@ -360,18 +360,18 @@ impl Shared {
     fn tell(&self, certificate: &Certificate, fault: Fault, peer: SocketAddr, what: &str) {
         let help = judge::help(fault);
         let why = format!("{what}: {fault}; {help}");
-        if let Some(untold) = self.another(certificate, &why) {
+        if let Some(suppressed) = self.another(certificate, &why) {
             warn!(
-                name = ?certificate.name(), issuer = ?certificate.issuer_name(), serial = %certificate.serial(), %peer, untold,
+                name = ?certificate.name(), issuer = ?certificate.issuer_name(), serial = %certificate.serial(), %peer, suppressed,
                 "a client {why}"
             );
         }
     }
 
     fn tell_chain(&self, certificate: &Certificate, peer: SocketAddr) {
-        if let Some(untold) = self.another(certificate, "chain") {
+        if let Some(suppressed) = self.another(certificate, "chain") {
             warn!(
-                name = ?certificate.name(), %peer, untold,
+                name = ?certificate.name(), %peer, suppressed,
                 "rejected a client: it sends issuer certificates together with its own; configure it to \
                  send only its own certificate"
             );

@@ -160,11 +160,11 @@ impl Actor {
         });
         self.tell(Told::Called);
         if let Err(refusal) = &answer
-            && let Some(untold) = self.refusals.admit("", Instant::now().into_std())
+            && let Some(suppressed) = self.refusals.admit("", Instant::now().into_std())
         {
             info!(
                 skill = self.facts.name,
-                untold, "{method} by {by} is refused: {refusal}"
+                suppressed, "{method} by {by} is refused: {refusal}"
             );
         }
         // The caller may have gone; the call has taken effect.

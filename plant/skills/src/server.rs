@@ -566,7 +566,7 @@ impl Leases {
                     None => return,
                 },
                 _ = look.tick() => if let Some(owner) = self.authority.release_idle(idle, Instant::now()) {
-                    tracing::info!("{owner} had nothing done for {idle:?}, and its lease is free");
+                    tracing::info!("released the lease of {owner}: it was idle for {idle:?}");
                     self.forget(&owner);
                 },
             }

@@ -269,11 +269,11 @@ pub(crate) async fn watch(
             pause = SHORTEST_PAUSE;
         }
         if (has_measured || logged.as_ref() != Some(&why))
-            && let Some(untold) = losses.admit(Instant::now().into_std())
+            && let Some(suppressed) = losses.admit(Instant::now().into_std())
         {
             tracing::warn!(
                 source = sensor.source(),
-                untold,
+                suppressed,
                 "cannot read a value: {why}"
             );
             logged = Some(why);

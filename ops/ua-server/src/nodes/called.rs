@@ -84,7 +84,7 @@ pub(super) fn set_result(method: &mut MethodCall, called: Result<Vec<Variant>, R
             method.set_status(StatusCode::BadInvalidArgument);
         }
         Err(Refused::Asked(error)) => {
-            info!(method = %method.method_id(), "a call came to nothing: {error}");
+            info!(method = %method.method_id(), "cannot execute a call of a Method: {error}");
             method.set_status(StatusCode::from(error.status.0));
         }
         Err(Refused::Status(status)) => method.set_status(status),
