@@ -532,7 +532,10 @@ impl Plant for Cell {
 
     fn reaches(&self, skill: &str, positions: &[[f64; 3]]) -> Result<(), String> {
         let workspace = self.found(skill)?.workspace;
-        workspace.map_or(Ok(()), |workspace| workspace.allows_all(positions))
+        workspace.map_or(Ok(()), |workspace| {
+            let allowed = workspace.allows_all(positions);
+            allowed.map_err(|why| why.to_string())
+        })
     }
 
     fn attachment(&self, component: &str) -> Attachment {

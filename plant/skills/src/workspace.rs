@@ -89,7 +89,7 @@ impl Workspace {
     ///
     /// # Errors
     /// The reason why the robot does not go to the first of the others.
-    pub fn allows_all(&self, positions: &[[f64; 3]]) -> Result<(), String> {
+    pub fn allows_all(&self, positions: &[[f64; 3]]) -> Result<(), OutOfWorkspace> {
         positions.iter().try_for_each(|at| self.allows(*at))
     }
 

@@ -73,7 +73,8 @@ impl Facts for Preferring {
             reach: (offer.component_name == "short").then_some(0.5),
             zones: Vec::new(),
         };
-        workspace.allows_all(positions)
+        let allowed = workspace.allows_all(positions);
+        allowed.map_err(|why| why.to_string())
     }
 
     fn attachment(&self, offer: &Offer) -> Attachment {

@@ -221,7 +221,7 @@ impl Handshake<'_> {
 
     /// Makes the value from outside effective: a parameter follows its service (Sync), or has its
     /// own mode and source.
-    async fn external(&self, parameter: &Parameter) -> Result<(), String> {
+    async fn external(&self, parameter: &Parameter) -> Result<(), ModuleError> {
         let name = &parameter.name;
         let of = |wanted| shaken(parameter, wanted);
         let sync = of("Sync");
