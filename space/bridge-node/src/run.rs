@@ -205,8 +205,8 @@ impl<P: Port> Shell<P> {
     }
 
     /// Handles a datagram and the datagrams queued behind it, up to a number of datagrams and of
-    /// bytes, and carries out each before the next is read. Under a flood, the other branches are then polled once for many
-    /// datagrams. Returns whether more datagrams may be queued.
+    /// bytes, and carries out each before the next is read. Under a flood, the other branches are
+    /// then polled once for many datagrams. Returns whether more datagrams may be queued.
     fn heard_all(&mut self, first: io::Result<Received>, buffer: &mut Vec<u8>) -> bool {
         let mut heard = first;
         let mut limits = self.turn.limits();

@@ -74,7 +74,8 @@ const fn bit(offset: u16, mask: u8) -> ByteTest {
 }
 
 // The headers of NetworkMessages (OPC 10000-14, 7.2.4.4.2).
-/// UADPFlags: version 1, PublisherId, GroupHeader and ExtendedFlags1, with or without PayloadHeader.
+/// UADPFlags: version 1, PublisherId, GroupHeader and ExtendedFlags1, with or without a
+/// PayloadHeader.
 const GROUP_OF_PUBLISHER: ByteTest = test(0, 0xBF, 0xB1);
 /// UADPFlags: version 1, PublisherId and ExtendedFlags1.
 const PUBLISHER_ALONE: ByteTest = test(0, 0xFF, 0x91);
