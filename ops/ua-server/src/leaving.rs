@@ -115,6 +115,16 @@ struct TopicWrites {
 }
 
 impl TopicWrites {
+    /// Returns the values before a newly reported value, which no client wrote.
+    fn behind(unsent: Unsent) -> Self {
+        let reported = usize::from(!unsent.is_held);
+        let before = unsent.all().saturating_sub(reported);
+        Self {
+            queued: (0..before).map(|_| Vec::new()).collect(),
+            held: None,
+        }
+    }
+
     fn is_empty(&self) -> bool {
         self.queued.is_empty() && self.held.is_none()
     }
@@ -128,9 +138,11 @@ impl TopicWrites {
         } else {
             self.queued.push_back(departures);
         }
-        while self.queued.len() > unsent.queued {
-            let dropped = self.queued.pop_front();
-            replace(dropped, self.queued.front_mut());
+        // A value that is partly sent is not dropped.
+        let oldest = usize::from(unsent.is_sending);
+        while self.queued.len() > unsent.all() {
+            let dropped = self.queued.remove(oldest);
+            replace(dropped, self.queued.get_mut(oldest));
         }
     }
 
@@ -148,7 +160,7 @@ impl TopicWrites {
         if !unsent.is_held {
             self.queued.extend(self.held.take());
         }
-        (self.queued.len() > unsent.queued)
+        (self.queued.len() > unsent.all())
             .then(|| self.queued.pop_front())
             .flatten()
     }
@@ -194,7 +206,7 @@ impl Leaving {
                 }
                 let writes = self.topics.entry(topic).or_insert_with(|| {
                     self.order.push_back(topic);
-                    TopicWrites::default()
+                    TopicWrites::behind(unsent)
                 });
                 writes.add(departures, unsent);
             }
@@ -248,9 +260,12 @@ impl Leaving {
 /// Answers the writes of a value that was dropped for a newer one. Writes of other fields wait for
 /// the newer value, which contains theirs.
 fn replace(dropped: Option<Vec<Departure>>, mut newer: Option<&mut Vec<Departure>>) {
-    let field = newer.as_ref().and_then(|newer| newer.first()?.field);
     for departure in dropped.into_iter().flatten() {
-        let is_other = field.is_some() && departure.field.is_some() && departure.field != field;
+        let is_other = departure.field.is_some()
+            && newer.as_ref().is_some_and(|newer| {
+                let mut fields = newer.iter().map(|one| one.field);
+                fields.all(|field| field.is_some() && field != departure.field)
+            });
         match &mut newer {
             Some(newer) if is_other => newer.push(departure),
             _ => departure.answer(REPLACED),
@@ -318,7 +333,11 @@ mod tests {
         ) -> Departing {
             let (departure, departing) = departure(field);
             self.leaving.add(departure);
-            self.unsent = Unsent { queued, is_held };
+            self.unsent = Unsent {
+                queued,
+                is_held,
+                ..self.unsent
+            };
             self.leaving.handled(Self::topic(30), verdict, self.unsent);
             departing
         }
@@ -399,6 +418,40 @@ mod tests {
         assert_eq!(answer_of(&mut third), None);
         writes.leave(Ok(()), 0);
         assert_eq!(third.left().await, Ok(()));
+    }
+
+    #[tokio::test]
+    async fn a_large_value_is_good_with_its_last_datagram_and_is_not_cancelled_by_a_newer_one() {
+        let mut writes = Writes::default();
+        let mut large = writes.write(Verdict::Forward, 1, false);
+        // It waits for the pace of large messages.
+        writes.unsent = Unsent {
+            is_sending: true,
+            ..Unsent::default()
+        };
+        writes.drain(false);
+        let newer = writes.write(Verdict::Forward, 1, false);
+        writes.leave(Ok(()), 1);
+        assert_eq!(answer_of(&mut large), None);
+        writes.unsent.is_sending = false;
+        writes.leave(Ok(()), 1);
+        assert_eq!(large.left().await, Ok(()));
+        writes.leave(Ok(()), 0);
+        assert_eq!(newer.left().await, Ok(()));
+    }
+
+    #[tokio::test]
+    async fn a_write_behind_a_large_value_of_the_program_is_answered_for_itself() {
+        let mut writes = Writes::default();
+        writes.unsent.is_sending = true;
+        let first = writes.write(Verdict::Forward, 1, false);
+        let mut second = writes.write(Verdict::ForwardAfterDroppingOldest, 1, false);
+        assert_eq!(first.left().await, Err(REPLACED));
+        writes.unsent.is_sending = false;
+        writes.leave(Ok(()), 1);
+        assert_eq!(answer_of(&mut second), None);
+        writes.leave(Ok(()), 0);
+        assert_eq!(second.left().await, Ok(()));
     }
 
     #[tokio::test]

@@ -191,8 +191,18 @@ impl Output {
 pub struct Unsent {
     /// The number of samples in the queue, without a message that is partly sent.
     pub queued: usize,
+    /// Whether a sample before the queue is partly sent, or waits for the pace of large messages.
+    pub is_sending: bool,
     /// Whether the newest sample waits for its time behind the queue, because of `at_most`.
     pub is_held: bool,
+}
+
+impl Unsent {
+    /// Returns the number of samples, without the one that waits for its time.
+    #[must_use]
+    pub fn all(self) -> usize {
+        self.queued.saturating_add(usize::from(self.is_sending))
+    }
 }
 
 /// Identifies a latched publisher of the local side among the publishers of its topic.

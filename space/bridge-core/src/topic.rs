@@ -94,6 +94,8 @@ pub(crate) struct Sending {
     pub(crate) message: Arc<Encoded>,
     /// The offset of the next chunk in the DataSetMessage.
     pub(crate) offset: usize,
+    /// Whether the message was sent before.
+    pub(crate) is_repeat: bool,
 }
 
 impl Item {

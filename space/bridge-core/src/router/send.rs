@@ -89,6 +89,10 @@ impl Router {
         let entry = self.values.topics.get(&topic);
         entry.map_or_else(Unsent::default, |entry| Unsent {
             queued: entry.queue.len(),
+            is_sending: entry
+                .sending
+                .as_ref()
+                .is_some_and(|sending| !sending.is_repeat),
             is_held: entry.gate.as_ref().is_some_and(|gate| gate.holds()),
         })
     }
@@ -155,6 +159,7 @@ impl Values {
             Some(_) => None,
             None => entry.take(&mut self.buffers),
         };
+        let is_repeat = entry.counters.repeated != repeated;
         let (datagram, delivery) = match item {
             Some(Item::Message(Message::Datagram(datagram))) => {
                 entry.counters.sent += 1;
@@ -165,14 +170,17 @@ impl Values {
                 (None, Some(delivery))
             }
             Some(Item::Message(Message::Large(message))) => {
-                entry.sending = Some(Sending { message, offset: 0 });
+                entry.sending = Some(Sending {
+                    message,
+                    offset: 0,
+                    is_repeat,
+                });
                 return self.send_chunk(at, now);
             }
             None if entry.sending.is_some() => return self.send_chunk(at, now),
             None => (None, None),
         };
-        let repeated = entry.counters.repeated != repeated;
-        if !repeated && (datagram.is_some() || delivery.is_some()) {
+        if !is_repeat && (datagram.is_some() || delivery.is_some()) {
             entry.note_value(now.monotonic);
         }
         entry.ready = entry.has_more();
@@ -180,7 +188,9 @@ impl Values {
             self.ready.push_back(at);
         }
         if datagram.is_some() {
-            self.tap.note(at.topic(), || Crossing::Sent { repeated });
+            self.tap.note(at.topic(), || Crossing::Sent {
+                repeated: is_repeat,
+            });
         }
         match datagram {
             Some(datagram) => self.datagram(at, datagram, now),
@@ -199,13 +209,21 @@ impl Values {
         let mut bytes = self.buffer();
         let keeps_time = self.keeps_time(at);
         let entry = self.topics.at_mut(at)?;
-        let Sending { message, offset } = entry.sending.take()?;
+        let Sending {
+            message,
+            offset,
+            is_repeat,
+        } = entry.sending.take()?;
         let first = message.time().filter(|_| keeps_time);
         let time = first.unwrap_or(now.utc);
         let written = chunk(&mut bytes, topic, (&message, offset), max_datagram, time);
         if let Ok(offset) = written {
             if offset < message.data_set_message().len() {
-                entry.sending = Some(Sending { message, offset });
+                entry.sending = Some(Sending {
+                    message,
+                    offset,
+                    is_repeat,
+                });
             } else {
                 entry.counters.sent += 1;
                 entry.note_value(now.monotonic);

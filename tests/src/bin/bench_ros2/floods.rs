@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, drops, drops_by_reason, metrics, now, number};
+use system_tests::{
+    Cell, METRICS_ROS1, METRICS_ROS2, drops, drops_by_reason, metrics, now, number,
+};
 
 use crate::ends::{Pace, SILENCE_MS};
 use crate::through::{NAMES, Ways};
