@@ -191,7 +191,6 @@ impl<P: Port> Shell<P> {
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
             more |= self.drain();
-            self.follow_interest();
             if more {
                 // The other tasks of the thread pass on the values of this turn first: the event
                 // loop of DDS, or another program. The budget of a task counts polls, and a poll
@@ -201,6 +200,8 @@ impl<P: Port> Shell<P> {
             if self.taps.is_on() || self.router.is_tapped() {
                 self.follow_taps();
             }
+            // A tap that begins sees all messages.
+            self.follow_interest();
         }
     }
 

@@ -376,7 +376,12 @@ impl<'a> Session<'a> {
     }
 
     fn publish(&mut self, message: QueuedMessage) {
-        let publication = message.0.clone();
+        let mut publication = message.0.clone();
+        if let Some(until) = message.1 {
+            // The broker stores it no longer than it has left here.
+            let now = TokioInstant::now().into_std();
+            publication.within = Some(until.saturating_duration_since(now));
+        }
         let id = match publication.confirmed {
             // All identifiers are used only if the broker confirms nothing.
             true => self.protocol.acquire_packet_id().ok(),

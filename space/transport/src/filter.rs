@@ -86,14 +86,24 @@ impl OwnFilter {
         self.companions = senders.companions.iter().map(source).collect();
         let mut sources = vec![source(&senders.own)];
         sources.extend_from_slice(&self.companions);
-        let wanted = Attached {
+        let mut wanted = Attached {
             sources,
             rules: self.rules.clone(),
         };
         if self.refused || self.set.as_ref() == Some(&wanted) {
             return;
         }
-        match attach(&wanted, receiver) {
+        let attached = attach(&wanted, receiver).or_else(|error| {
+            if wanted.rules.is_empty() {
+                return Err(error);
+            }
+            // The kernel may refuse a long filter.
+            debug!(%error, "the kernel does not filter by namespace");
+            self.rules.clear();
+            wanted.rules.clear();
+            attach(&wanted, receiver)
+        });
+        match attached {
             Ok(()) => self.set = Some(wanted),
             Err(error) => {
                 self.refused = true;

@@ -77,6 +77,11 @@ impl Router {
         if self.values.tap.is_on() {
             return None;
         }
+        let mut topics = self.values.topics.iter();
+        if topics.any(|(_, topic)| topic.confirming.is_some()) {
+            // Confirmations have the PublisherIds of the bridges.
+            return None;
+        }
         let own = self.values.settings.own;
         let namespaces = owned.iter().map(|namespace| (own, *namespace));
         let mut announced: BTreeSet<SpaceId> = used.iter().map(|(space, _)| *space).collect();
