@@ -166,8 +166,7 @@ impl<P: Port> Shell<P> {
                 event = self.port.recv() => more = self.port_events(event).await?,
                 () = links.as_mut(), if self.watches_links() => {
                     links.as_mut().reset(TokioInstant::now() + redundancy::LINK_LOOK);
-                    self.look_at_held()?;
-                    self.look_at_fitness();
+                    self.look_at_links();
                 }
                 () = timer.as_mut() => {
                     self.read_waiting(&mut buffer);

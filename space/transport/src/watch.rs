@@ -147,6 +147,10 @@ pub struct Held {
 struct Holding {
     interface: Interface,
     state: State,
+    /// State at the last call of [`Held::look`].
+    reported: State,
+    /// True if the interface was removed at that call or since.
+    was_gone: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -187,13 +191,18 @@ impl Held {
     }
 
     fn of(held: Vec<Interface>, all: bool) -> Self {
-        let holding = |interface: Interface| Holding {
-            state: if interface.up {
+        let holding = |interface: Interface| {
+            let state = if interface.up {
                 State::There
             } else {
                 State::Down
-            },
-            interface,
+            };
+            Holding {
+                interface,
+                state,
+                reported: state,
+                was_gone: false,
+            }
         };
         Self {
             held: held.into_iter().map(holding).collect(),
@@ -202,9 +211,17 @@ impl Held {
         }
     }
 
-    /// Checks the interfaces.
+    /// Checks the interfaces, and returns the changes since the last call.
     pub fn look(&mut self) -> Vec<Finding> {
         interfaces().map_or_else(|_not_now| Vec::new(), |present| self.see(&present))
+    }
+
+    /// Updates the state that [`lost`](Self::lost) returns. The next [`look`](Self::look) returns
+    /// the changes, but not a loss of the link that is already over.
+    pub fn refresh(&mut self) {
+        if let Ok(present) = interfaces() {
+            self.update(&present);
+        }
     }
 
     /// Returns the reason why the library cannot communicate: each of its interfaces is removed or
@@ -216,19 +233,30 @@ impl Held {
         none.then(|| first.why())
     }
 
-    fn see(&mut self, present: &[Interface]) -> Vec<Finding> {
-        let mut findings = Vec::new();
+    fn update(&mut self, present: &[Interface]) {
         for holding in &mut self.held {
             let now = present.iter().find(|one| one.is_same(&holding.interface));
-            let state = match now {
+            holding.state = match now {
                 Some(now) if now.up => State::There,
                 Some(_) => State::Down,
                 None => State::Gone,
             };
-            let before = std::mem::replace(&mut holding.state, state);
+            holding.was_gone |= holding.state == State::Gone;
+        }
+    }
+
+    fn see(&mut self, present: &[Interface]) -> Vec<Finding> {
+        self.update(present);
+        let is_there = |holding: &Holding| holding.reported == State::There;
+        let was_there = self.held.iter().any(is_there);
+        let mut findings = Vec::new();
+        for holding in &mut self.held {
+            let state = holding.state;
+            let before = std::mem::replace(&mut holding.reported, state);
+            let was_gone = std::mem::replace(&mut holding.was_gone, state == State::Gone);
             match (before, state) {
                 // The kernel removed its state together with the interface.
-                (State::Gone, State::There | State::Down) => {
+                (_, State::There | State::Down) if was_gone => {
                     findings.push(Finding::Void(format!(
                         "the network interface {} was created again",
                         holding.interface
@@ -243,15 +271,17 @@ impl Held {
                 _ => {}
             }
         }
-        findings.extend(self.changed(present));
+        findings.extend(self.changed(present, was_there));
         findings
     }
 
-    /// Returns present interfaces that replace a held interface or are new.
-    fn changed(&mut self, present: &[Interface]) -> Vec<Finding> {
+    /// Returns present interfaces that replace a held interface or are new. `was_there` is whether
+    /// a held interface was up at the check before: links that are down at one check only may be up
+    /// again soon, so no new interface replaces them yet.
+    fn changed(&mut self, present: &[Interface], was_there: bool) -> Vec<Finding> {
         let mut findings = Vec::new();
         let usable = |one: &&Interface| one.up && !one.address.is_loopback();
-        let none_is_there = self.held.iter().all(|held| held.state != State::There);
+        let is_there = self.held.iter().any(|held| held.state == State::There);
         for one in present.iter().filter(usable) {
             let mut of_name = self.held.iter().filter(|h| h.interface.name == one.name);
             if of_name.any(|h| h.interface.is_same(one)) {
@@ -267,7 +297,7 @@ impl Held {
                         gone.interface, one.address
                     )
                 }));
-            } else if self.all && none_is_there {
+            } else if self.all && !was_there && !is_there {
                 findings.push(Finding::Void(format!(
                     "the network interface {one} appeared"
                 )));
@@ -303,6 +333,13 @@ mod tests {
             index,
             address: Ipv4Addr::new(10, 77, 0, last),
             up: true,
+        }
+    }
+
+    fn other() -> Interface {
+        Interface {
+            name: "wlan0".to_owned(),
+            ..wire(7, 9)
         }
     }
 
@@ -418,11 +455,39 @@ mod tests {
     }
 
     #[test]
+    fn a_link_that_is_down_for_a_moment_does_not_make_what_a_library_holds_void() {
+        let mut held = Held::of(vec![wire(3, 1)], true);
+        let flap = [down(wire(3, 1)), other()];
+        assert_eq!(held.see(&[wire(3, 1), other()]), [Finding::Late(other())]);
+        // Between two checks, only the fitness follows the link.
+        held.update(&flap);
+        assert!(held.lost().is_some());
+        held.update(&[wire(3, 1), other()]);
+        assert_eq!(held.lost(), None);
+        assert_eq!(held.see(&[wire(3, 1), other()]), []);
+        // At a check, the loss is reported first. It is void if the link stays down.
+        held.update(&flap);
+        assert!(matches!(held.see(&flap)[..], [Finding::Lost(_)]));
+        held.update(&flap);
+        assert!(matches!(held.see(&flap)[..], [Finding::Void(_)]));
+    }
+
+    #[test]
+    fn an_interface_that_was_removed_between_two_checks_is_void_at_the_next() {
+        let mut held = Held::of(vec![wire(3, 1)], false);
+        held.update(&[]);
+        held.update(&[wire(3, 1)]);
+        assert_eq!(held.lost(), None);
+        assert!(matches!(held.see(&[wire(3, 1)])[..], [Finding::Void(_)]));
+        assert_eq!(held.see(&[wire(3, 1)]), []);
+        held.update(&[]);
+        assert!(matches!(held.see(&[])[..], [Finding::Lost(_)]));
+        assert!(matches!(held.see(&[wire(3, 1)])[..], [Finding::Void(_)]));
+    }
+
+    #[test]
     fn an_interface_that_comes_late_is_told_of_where_all_are_wanted() {
-        let other = Interface {
-            name: "wlan0".to_owned(),
-            ..wire(7, 9)
-        };
+        let other = other();
         let both = [wire(3, 1), other.clone()];
         let mut one = Held::of(vec![wire(3, 1)], false);
         assert_eq!(one.see(&both), []);

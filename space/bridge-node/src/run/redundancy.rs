@@ -91,6 +91,15 @@ impl<P: Port> Shell<P> {
         self.held.is_some() && self.router.redundancy().is_some()
     }
 
+    /// Checks the links of the ROS side. Changes are reported by the check of each second, so that
+    /// a link that is down for a moment does not end the program.
+    pub(super) fn look_at_links(&mut self) {
+        if let Some(held) = &mut self.held {
+            held.refresh();
+        }
+        self.look_at_fitness();
+    }
+
     /// Sets whether the ROS side is within reach.
     pub(super) fn look_at_fitness(&mut self) {
         if self.router.redundancy().is_none() {
