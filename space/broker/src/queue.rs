@@ -73,7 +73,7 @@ impl SendQueue {
             self.replaced += 1;
             return Ok(());
         }
-        if !self.make_room(&publication) {
+        if !self.make_room(&publication, now) {
             return Err(SendError::Busy);
         }
         self.bytes += publication.payload.len();
@@ -81,25 +81,44 @@ impl SendQueue {
         Ok(())
     }
 
-    /// Makes room for a message: the oldest states leave the queue, of which newer states wait.
-    /// Returns whether the message fits.
-    fn make_room(&mut self, publication: &QueuedPublish) -> bool {
+    /// Makes room for a message in a full queue: expired messages leave it, and then the oldest
+    /// states of which newer states wait. [`FREED`] states leave at once, so that the next messages
+    /// need no search. Returns whether the message fits.
+    fn make_room(&mut self, publication: &QueuedPublish, now: Instant) -> bool {
         if self.has_room(publication) {
             return true;
         }
-        let mut superseded = self.superseded(publication);
-        let mut removed = 0;
-        while !self.has_room(publication) {
-            let Some(oldest) = superseded.pop() else {
-                return false;
-            };
-            let older = self.waiting.remove(oldest - removed);
-            let bytes = older.map_or(0, |(of, _)| of.payload.len());
-            self.bytes = self.bytes.saturating_sub(bytes);
-            removed += 1;
-            self.replaced += 1;
+        self.remove_expired(now);
+        if self.has_room(publication) {
+            return true;
         }
-        true
+        let size = publication.payload.len();
+        let mut superseded = self.superseded(publication);
+        let mut oldest = superseded.pop();
+        let (mut at, mut removed) = (0, 0);
+        self.waiting.retain(|(older, _)| {
+            let leaves = oldest == Some(at) && (removed < FREED || self.bytes + size > MAX_BYTES);
+            at += 1;
+            if leaves {
+                self.bytes = self.bytes.saturating_sub(older.payload.len());
+                removed += 1;
+                oldest = superseded.pop();
+            }
+            !leaves
+        });
+        self.replaced += count(removed);
+        self.has_room(publication)
+    }
+
+    fn remove_expired(&mut self, now: Instant) {
+        self.waiting.retain(|(publication, until)| {
+            let is_expired = until.is_some_and(|until| now > until);
+            if is_expired {
+                self.bytes = self.bytes.saturating_sub(publication.payload.len());
+                self.expired += 1;
+            }
+            !is_expired
+        });
     }
 
     /// Returns the places of the states of which a newer state waits or is `next`, the oldest last.
@@ -185,7 +204,7 @@ impl SendQueue {
             let _full = self.push(publication.clone(), now).is_err();
         }
         for state in states {
-            if self.make_room(&state.0) {
+            if self.make_room(&state.0, now) {
                 self.bytes += state.0.payload.len();
                 self.waiting.push_back(state);
             } else {
@@ -204,6 +223,8 @@ fn count(number: usize) -> u64 {
 }
 
 const MAX_WAITING: usize = 4096;
+/// The number of states that leave a full queue at once.
+const FREED: usize = MAX_WAITING / 16;
 const MAX_BYTES: usize = 64 << 20;
 
 #[cfg(test)]
@@ -368,11 +389,13 @@ mod tests {
         for _ in 0..MAX_WAITING {
             queue.push(confirmed("often", 2), start).unwrap();
         }
-        assert_eq!((queue.waiting.len(), queue.replaced), (MAX_WAITING, 2));
+        let waiting = MAX_WAITING + 2 - FREED;
+        assert_eq!(queue.waiting.len(), waiting);
+        assert_eq!(queue.replaced, count(FREED));
         queue.push(confirmed("another", 3), start).unwrap();
         let topics: Vec<&str> = queue.waiting.iter().map(|(of, _)| &of.topic[..]).collect();
         assert_eq!(topics[..3], ["seldom", "event", "often"]);
-        assert_eq!(topics[MAX_WAITING - 2..], ["often", "another"]);
+        assert_eq!(topics[waiting - 1..], ["often", "another"]);
         // The bytes are bounded too, and a message that cannot fit is refused.
         let large = |topic, bytes| QueuedPublish {
             payload: vec![0; bytes],
@@ -385,6 +408,23 @@ mod tests {
         assert!(queue.bytes <= MAX_BYTES);
         let refused = queue.push(large("other", MAX_BYTES), start);
         assert_eq!(refused, Err(SendError::Busy));
+    }
+
+    #[test]
+    fn expired_messages_leave_a_full_queue_before_states_do() {
+        let mut queue = SendQueue::default();
+        let start = start();
+        for _ in 2..MAX_WAITING {
+            queue
+                .push(publication("stop", Some(1000), false), start)
+                .unwrap();
+        }
+        let later = start + Duration::from_millis(1001);
+        queue.push(confirmed("a", 1), later).unwrap();
+        queue.push(confirmed("a", 2), later).unwrap();
+        queue.push(confirmed("a", 3), later).unwrap();
+        assert_eq!(queue.expired, count(MAX_WAITING - 2));
+        assert_eq!((queue.replaced, queue.bytes), (0, 3));
     }
 
     #[test]
