@@ -16,6 +16,8 @@ pub(crate) struct Place {
     /// The time at which the NetworkMessage was sent.
     pub(crate) sent: Option<Timestamp>,
     pub(crate) from: SocketAddr,
+    /// Whether a broker delivered the message.
+    pub(crate) is_relayed: bool,
     /// The maximum time for which the writer may hold back a sample before sending it.
     pub(crate) held_back: Duration,
     /// Whether the stamps may come from clients of an OPC UA server, which have their own clocks.

@@ -456,13 +456,34 @@ impl Reader {
         Reason::Repeat
     }
 
-    /// Returns whether a sample was delivered, by its stamp. After the end of a writer this
-    /// distinguishes a datagram delayed by the network from the first datagram of a restarted
-    /// writer. A stored value of a restarted writer is not an event.
+    /// Returns whether a sample was delivered, by its stamp or its sequence number. After the end
+    /// of a writer this distinguishes a datagram delayed by the network from the first datagram of
+    /// a restarted writer. A stored value of a restarted writer is not an event.
     fn came_before(&self, place: &Place, handling: Handling) -> bool {
         let is_known = |stamp| self.known.iter().any(|known| known.stamp == stamp);
         let stored = place.is_stored() && handling != Handling::Event;
-        !stored && place.instance().is_some_and(is_known)
+        match place.instance() {
+            Some(stamp) => !stored && is_known(stamp),
+            None => self.is_resent(place, handling),
+        }
+    }
+
+    /// Returns whether a sample without a precise stamp is one of the last samples that a broker
+    /// delivered. After a lost connection to the broker, a writer sends the states again that were
+    /// not confirmed.
+    fn is_resent(&self, place: &Place, handling: Handling) -> bool {
+        let (Some(last), Some(sequence)) = (self.sequence, place.sequence) else {
+            return false;
+        };
+        let order = SequenceOrder::of_u16(last, sequence);
+        let is_near = matches!(
+            order,
+            SequenceOrder::Older {
+                by: 1..=MOST_RESENT
+            }
+        );
+        let is_older = matches!((place.stamp, self.stamp), (Some(of), Some(last)) if of <= last);
+        place.is_relayed && handling != Handling::Event && is_near && is_older
     }
 
     /// Returns the stamp of the value that the local side must not store any more.
@@ -657,6 +678,8 @@ impl Reader {
 /// because any sender in the group can invent topics, and all of them together must not occupy more
 /// than some megabytes.
 const MAX_SMALL: usize = 4_096;
+/// The maximum number of states that a writer sends to a broker again. Bridges send at most 20.
+const MOST_RESENT: u32 = 32;
 /// The number of samples with recognised repetitions: as many as a writer keeps.
 const MAX_KNOWN: usize = MAX_KEPT;
 /// The waiting time of the second change of an announced type, and the maximum number of its

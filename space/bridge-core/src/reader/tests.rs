@@ -13,6 +13,7 @@ fn place(sequence: u16, stamp: i128) -> Place {
         fine: true,
         sent: None,
         from: address(1),
+        is_relayed: false,
         held_back: Duration::ZERO,
         by_clients: false,
     }
@@ -98,6 +99,44 @@ fn a_datagram_that_comes_after_the_end_of_its_writer_is_handed_on_once() {
         // The next writer starts with a clock that was set back.
         assert_eq!(admit(&mut reader, place(0, 500)).err(), None);
     }
+}
+
+#[test]
+fn states_that_a_broker_delivers_again_after_a_silence_are_no_restart() {
+    let (mut reader, now) = reader();
+    let coarse = |sequence: u16, stamp: i128| Place {
+        fine: false,
+        is_relayed: true,
+        ..place(sequence, stamp)
+    };
+    let hear = |reader: &mut Reader, place: Place| -> Result<Kept, Reason> {
+        let (_, kept) = admit(reader, place, now)?;
+        reader.delivered(place.instance(), (kept, false), now);
+        Ok(kept)
+    };
+    for sequence in 1..=50 {
+        let place = coarse(sequence, i128::from(sequence) * 1000);
+        assert_eq!(hear(&mut reader, place), Ok(Kept::Alone));
+    }
+    assert!(reader.fell_silent(now + PERIOD, PERIOD));
+    for sequence in 31..50 {
+        let place = coarse(sequence, i128::from(sequence) * 1000);
+        assert_eq!(hear(&mut reader, place), Err(Reason::Stale));
+    }
+    let last = coarse(50, 50_000);
+    assert_eq!(hear(&mut reader, last), Err(Reason::Duplicate));
+    assert_eq!(hear(&mut reader, coarse(51, 51_000)), Ok(Kept::Alone));
+    // A restart shows by a newer stamp, by a number far behind, or without a broker.
+    assert!(!reader.leave());
+    assert_eq!(hear(&mut reader, coarse(40, 52_000)), Ok(Kept::Alone));
+    assert!(!reader.leave());
+    assert_eq!(hear(&mut reader, coarse(0, 500)), Ok(Kept::Alone));
+    assert!(!reader.leave());
+    let without_broker = Place {
+        is_relayed: false,
+        ..coarse(65_535, 400)
+    };
+    assert_eq!(hear(&mut reader, without_broker), Ok(Kept::Alone));
 }
 
 #[test]

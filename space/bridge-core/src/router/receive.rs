@@ -283,9 +283,9 @@ impl Values {
                 "the writer marked its DataSetMessage as invalid".to_owned()
             });
         }
-        let mut place = place(topic, message, (from, sent));
-        let local = self.settings.local;
         let relay = self.arrival;
+        let mut place = place(topic, message, (from, sent), relay.is_some());
+        let local = self.settings.local;
         let since_takeover = self.since_takeover(&place, now);
         let Some(at) = self.entry(topic, from, now) else {
             return;
@@ -651,6 +651,7 @@ fn place(
     topic: TopicId,
     message: &DataSetMessage<'_>,
     (from, sent): (SocketAddr, Option<Timestamp>),
+    is_relayed: bool,
 ) -> Place {
     let header = message.header();
     Place {
@@ -663,6 +664,7 @@ fn place(
         fine: header.picoseconds.is_some() && message.kind == MessageKind::KeyFrame,
         sent,
         from,
+        is_relayed,
         held_back: Duration::ZERO,
         by_clients: topic.space == SpaceId::UA,
     }
