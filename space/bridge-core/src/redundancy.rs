@@ -138,6 +138,7 @@ pub struct Redundancy {
     followed: Option<u32>,
     /// The last heartbeat of an active bridge, including this bridge.
     active_at: Option<Instant>,
+    /// The other bridges, in the order in which they were met.
     peers: Vec<RedundantPeer>,
     counts: RedundancyCounts,
     last: Option<Takeover>,
@@ -554,7 +555,8 @@ impl Redundancy {
         RoleChange::Muted { cause }
     }
 
-    /// Records a peer. Returns its heartbeat before.
+    /// Records a peer. Returns its heartbeat before. If there are too many peers, the peer that was
+    /// met last is removed, so that invented peers do not displace a bridge that is known.
     fn meet(&mut self, heartbeat: Heartbeat, from: SocketAddr, now: Instant) -> Option<Heartbeat> {
         let known = |peer: &&mut RedundantPeer| peer.heartbeat.instance == heartbeat.instance;
         if let Some(known) = self.peers.iter_mut().find(known) {
@@ -563,12 +565,7 @@ impl Redundancy {
             return Some(std::mem::replace(&mut known.heartbeat, heartbeat));
         }
         self.peers.retain(|peer| peer.age(now) < FORGOTTEN);
-        if self.peers.len() >= MOST_PEERS {
-            let oldest = (0..).zip(&self.peers).min_by_key(|(_, peer)| peer.heard);
-            if let Some(oldest) = oldest.map(|(at, _)| at) {
-                self.peers.remove(oldest);
-            }
-        }
+        self.peers.truncate(MOST_PEERS - 1);
         self.peers.push(RedundantPeer {
             heartbeat,
             address: SenderAddress::new(from, now),

@@ -34,10 +34,14 @@ impl SenderAddress {
         from != self.first && now.saturating_duration_since(self.heard) < MOVED
     }
 
+    /// Returns whether the first address has been silent for so long that it is forgotten.
+    pub(crate) fn is_forgotten(&self, now: Instant) -> bool {
+        now.saturating_duration_since(self.heard) >= FORGOTTEN
+    }
+
     /// Records a heartbeat that is not forged.
     pub(crate) fn note(&mut self, from: SocketAddr, now: Instant) {
-        let silence = now.saturating_duration_since(self.heard);
-        if from == self.first || silence >= FORGOTTEN {
+        if from == self.first || self.is_forgotten(now) {
             (self.first, self.heard) = (from, now);
         }
         self.last = from;

@@ -505,3 +505,18 @@ fn a_takeover_waits_for_messages_that_have_arrived_but_not_for_ever() {
         "{taken:?}"
     );
 }
+
+#[test]
+fn invented_heartbeats_do_not_displace_a_bridge_that_is_known() {
+    let now = start();
+    let mut state = Redundancy::new(Rank::new(2).unwrap(), 2, now);
+    let known = Redundancy::new(Rank::new(1).unwrap(), 1, now).heartbeat();
+    state.hear(known, address(1), now);
+    for instance in 100..120 {
+        let invented = Heartbeat { instance, ..known };
+        state.hear(invented, address(2), now);
+    }
+    assert_eq!(state.peers(now.monotonic).count(), MOST_PEERS);
+    assert!(state.is_peer(address(1)));
+    assert!(state.is_forged(&known, address(2), now.monotonic));
+}

@@ -25,8 +25,15 @@ struct ActiveSender {
     heartbeat: Heartbeat,
     from: SocketAddr,
     at: Instant,
-    /// The addresses of all bridges of the space, by instance.
-    members: BTreeMap<u32, SenderAddress>,
+    /// The bridges of the space, in the order in which they were met.
+    members: Vec<Member>,
+}
+
+/// A redundant bridge of another space.
+#[derive(Debug)]
+struct Member {
+    instance: u32,
+    address: SenderAddress,
 }
 
 impl RedundantSenders {
@@ -38,8 +45,9 @@ impl RedundantSenders {
         (from, at): (SocketAddr, Instant),
     ) -> bool {
         let sender = self.of.get(&space);
-        let member = sender.and_then(|sender| sender.members.get(&heartbeat.instance()));
-        member.is_some_and(|member| member.is_forged(from, at))
+        let mut members = sender.into_iter().flat_map(|sender| &sender.members);
+        let member = members.find(|member| member.instance == heartbeat.instance());
+        member.is_some_and(|member| member.address.is_forged(from, at))
     }
 
     /// Records the heartbeat of a bridge of another space.
@@ -53,16 +61,9 @@ impl RedundantSenders {
             heartbeat,
             from,
             at,
-            members: BTreeMap::new(),
+            members: Vec::new(),
         });
-        let is_known = sender.members.contains_key(&heartbeat.instance());
-        if !is_known && sender.members.len() >= MOST_MEMBERS {
-            sender.members.clear();
-        }
-        let member = sender.members.entry(heartbeat.instance());
-        member
-            .or_insert_with(|| SenderAddress::new(from, at))
-            .note(from, at);
+        sender.note((heartbeat.instance(), from), at);
         let same = sender.heartbeat.instance() == heartbeat.instance();
         let before = sender.heartbeat.precedence();
         let stale = at.saturating_duration_since(sender.at) >= SENDER_LOST;
@@ -88,7 +89,7 @@ impl RedundantSenders {
             && now.monotonic.saturating_duration_since(sender.at) < SENDER_LOST;
         let is_superseded = is_known
             && sender.from != from
-            && sender.members.values().any(|member| member.last() == from);
+            && sender.members.iter().any(|of| of.address.last() == from);
         if is_superseded {
             let active = sender.from;
             let cause = (Reason::Takeover, "superseded");
@@ -113,8 +114,56 @@ impl RedundantSenders {
     }
 }
 
+impl ActiveSender {
+    /// Records a bridge of the space. If there are too many, the bridge that was met last is
+    /// removed, so that invented bridges do not displace a bridge that is known.
+    fn note(&mut self, (instance, from): (u32, SocketAddr), at: Instant) {
+        let mut members = self.members.iter_mut();
+        if let Some(known) = members.find(|member| member.instance == instance) {
+            return known.address.note(from, at);
+        }
+        if self.members.len() >= MOST_MEMBERS {
+            self.members
+                .retain(|member| !member.address.is_forgotten(at));
+            self.members.truncate(MOST_MEMBERS - 1);
+        }
+        self.members.push(Member {
+            instance,
+            address: SenderAddress::new(from, at),
+        });
+    }
+}
+
 /// The time after which the active bridge of another space counts as lost.
 const SENDER_LOST: Duration = Duration::from_secs(1);
 /// The maximum number of known bridges of another space. It is limited, because any sender in an
 /// unsecured group can send heartbeats.
 const MOST_MEMBERS: usize = 8;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::redundancy::{Rank, Redundancy};
+
+    #[test]
+    #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
+    fn invented_heartbeats_do_not_displace_a_bridge_that_is_known() {
+        let now = Now {
+            monotonic: Instant::now(),
+            utc: uadp::Timestamp::from_unix_nanos(1_700_000_000_000_000_000),
+        };
+        let address = |port: u16| SocketAddr::from(([127, 0, 0, 1], port));
+        let of = |instance| Redundancy::new(Rank::new(1).unwrap(), instance, now).heartbeat();
+        let space = SpaceId::new(3).unwrap();
+        let mut senders = RedundantSenders::default();
+        senders.meet(space, of(1), (address(1), now.monotonic));
+        for instance in 100..120 {
+            senders.meet(space, of(instance), (address(2), now.monotonic));
+        }
+        let is_forged = |of| senders.is_forged(space, &of, (address(3), now.monotonic));
+        assert!(is_forged(of(1)));
+        // Of the others, the bridges that were met first and the newest are known.
+        assert!(is_forged(of(100)) && is_forged(of(119)));
+        assert!(!is_forged(of(110)));
+    }
+}
