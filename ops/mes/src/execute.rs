@@ -366,6 +366,8 @@ impl Execution<'_> {
                 let all = chosen.open.iter().map(|(_, offer)| offer);
                 let all = all.chain(chosen.undo.values());
                 let all = all.chain(kept.iter().map(|kept| &kept.offer));
+                // Earlier rounds of loops are compensated by their own components.
+                let all = all.chain(progress.done.iter().filter_map(|done| done.undo.as_ref()));
                 let components = all.map(|offer| offer.component.clone()).collect();
                 if self.plant.lease(&run, &components) {
                     return Ok((plan, chosen));

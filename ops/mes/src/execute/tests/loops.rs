@@ -164,3 +164,43 @@ async fn each_round_of_a_loop_is_compensated() {
     assert_eq!(ran[..2], ["one.Count", "one.Count"]);
     assert_eq!(ran[ran.len() - 2..], ["one.Undo", "one.Undo"]);
 }
+
+#[tokio::test]
+async fn a_component_of_an_earlier_round_stays_reserved_for_its_compensation() {
+    let mut fakes = vessels();
+    fakes.fails_at = Some("three.End");
+    let undo = offer("one", "Undo", "UndoType");
+    fakes.offers.lock().unwrap().push(undo);
+    let mut process = counted(repeated(&[0], (0, runs_below(2)), 10));
+    process.steps[0].compensation = Some(Box::new(Step {
+        by: By::SameAs(0),
+        ..alone(3, "undo", "UndoType")
+    }));
+    let fakes = Arc::new(fakes);
+    let reserved = Mutex::new(Vec::new());
+    // During the first round, `four` takes the place of `one`, which can only undo then.
+    let teller = |step: &'static str| {
+        let mut offers = fakes.offers.lock().unwrap();
+        if step == "Step" && offers.iter().all(|offer| offer.component_name != "four") {
+            offers.retain(|offer| (&*offer.component_name, &*offer.name) != ("one", "Count"));
+            offers.push(offer("four", "Count", "CountType"));
+            offers.push(offer("four", "Undo", "UndoType"));
+        }
+        if step == "Compensate" {
+            let leases = fakes.leases.lock().unwrap();
+            reserved
+                .lock()
+                .unwrap()
+                .push(leases.contains_key("urn:example:one"));
+        }
+    };
+    let plant: Arc<dyn Plant> = Arc::new(Arc::clone(&fakes));
+    let run = execute(&plant, &process, 1, &teller).await;
+    assert_eq!(run.outcome, How::Failed);
+    let ran = ran(&fakes);
+    let rounds = ["one.Count", "four.Count", "four.Count"];
+    assert_eq!(ran[..3], rounds, "{run:?}");
+    let undone = ["four.Undo", "four.Undo", "one.Undo"];
+    assert_eq!(ran[ran.len() - 3..], undone, "{run:?}");
+    assert_eq!(*reserved.lock().unwrap(), [true; 3]);
+}
