@@ -622,8 +622,8 @@ impl Log {
     }
 }
 
-/// Maximum number of plans of a run that may break. Rounds of loops are bounded by their own
-/// maximum.
+/// Maximum number of plans of a run that may break. Rounds of loops have maximums of their own,
+/// for each loop and for all loops of a run.
 const MOST_PLANS: usize = 10;
 const MOST_FALLEN: usize = 100;
 const CLOSE: Duration = Duration::from_secs(3);

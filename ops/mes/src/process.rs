@@ -69,6 +69,8 @@ impl Loop {
     pub(crate) const USUAL_ROUNDS: u32 = 100;
     /// Largest possible maximum: each round is a plan of its own in the record of the run.
     pub(crate) const MOST_ROUNDS: u32 = 500;
+    /// Maximum number of rounds of all loops of a run: loops within loops multiply.
+    pub(crate) const MOST_ROUNDS_OF_RUN: u32 = 2000;
 
     /// Returns whether a loop is a part of another loop.
     pub(crate) fn is_within(&self, other: &Self) -> bool {

@@ -22,6 +22,8 @@ pub(super) struct Progress {
     pub(super) passed: BTreeMap<usize, Passed>,
     /// The completed rounds of loops whose steps are done again, by the numbers of the loops.
     rounds: BTreeMap<usize, u32>,
+    /// The completed rounds of all loops after which another one began.
+    all_rounds: u32,
     /// The loops after their last round.
     left: BTreeSet<usize>,
 }
@@ -67,7 +69,7 @@ impl Progress {
     ///
     /// # Errors
     /// The condition that cannot be decided, or the maximum number of rounds.
-    fn next_round(&mut self, process: &Process) -> Result<bool, String> {
+    pub(super) fn next_round(&mut self, process: &Process) -> Result<bool, String> {
         loop {
             let mut loops = process.loops.iter().enumerate();
             let over = loops.find(|(number, one)| {
@@ -94,6 +96,13 @@ impl Progress {
                     "the loop of `{name}` has had {rounds} rounds, its maximum, and another one is due"
                 ));
             }
+            if self.all_rounds >= Loop::MOST_ROUNDS_OF_RUN {
+                return Err(format!(
+                    "the loops of the process have had {} rounds in all, the maximum of a run, and another one of `{name}` is due",
+                    self.all_rounds
+                ));
+            }
+            self.all_rounds = self.all_rounds.saturating_add(1);
             info!(step = name, rounds, "another round of a loop begins");
             self.repeat(process, over);
             return Ok(true);

@@ -1,6 +1,7 @@
 //! Steps that are done in rounds.
 
 use super::*;
+use crate::execute::sequence::Passed;
 use crate::process::{BadEnd, By, Compare, Condition, Loop, Test};
 
 /// A loop over steps, which is repeated while a condition about one of them holds.
@@ -143,6 +144,45 @@ async fn an_inner_loop_begins_anew_in_each_round_of_the_outer_one() {
         [&round[..], &round, &["three.End"]].concat(),
         "{run:?}"
     );
+}
+
+#[test]
+fn loops_within_loops_have_a_maximum_of_rounds_in_all() {
+    let has_failed = |is_negated| {
+        vec![vec![Condition {
+            step: 1,
+            test: Test::Ended(BadEnd::Failed),
+            is_negated,
+        }]]
+    };
+    // The inner loop goes on after a failure, the outer one after the last inner round.
+    let mut process = counted(Loop {
+        steps: [0, 1].into(),
+        again: has_failed(true),
+        rounds: Loop::MOST_ROUNDS,
+    });
+    process.loops.push(Loop {
+        steps: [1].into(),
+        again: has_failed(false),
+        rounds: Loop::MOST_ROUNDS,
+    });
+    let mut progress = Progress::default();
+    let mut rounds = 0;
+    let why = loop {
+        let end = match rounds % 10 {
+            9 => Passed::Skipped,
+            _ => Passed::Ended(BadEnd::Failed),
+        };
+        progress.passed.insert(0, Passed::Skipped);
+        progress.passed.insert(1, end);
+        match progress.next_round(&process) {
+            Ok(is_due) => assert!(is_due, "round {rounds}"),
+            Err(why) => break why,
+        }
+        rounds += 1;
+    };
+    assert_eq!(rounds, Loop::MOST_ROUNDS_OF_RUN);
+    assert!(why.contains("2000 rounds in all"), "{why}");
 }
 
 #[tokio::test]
