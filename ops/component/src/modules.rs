@@ -12,6 +12,7 @@ use std::process::{ExitCode, Stdio};
 use std::time::Duration;
 
 use clap::Parser as _;
+use plant_opcua::synced;
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::process::{Child, Command};
 use tokio::signal::unix::{SignalKind, signal};
@@ -171,10 +172,14 @@ impl Supervisor {
             ))
         })?;
         if is_new {
-            write_whole(
-                &self.state.join(NUMBERS),
-                &serde_json::to_string_pretty(&self.numbers)?,
-            )?;
+            let file = self.state.join(NUMBERS);
+            let text = serde_json::to_string_pretty(&self.numbers).map_err(io::Error::from);
+            let written = text.and_then(|text| write_whole(&file, &text));
+            if let Err(error) = written {
+                // After a restart, another module would get a number that is not in the file.
+                self.numbers.forget(name);
+                return Err(error);
+            }
         }
         let settings = read_settings(&manifest.with_extension("yaml"))?;
         let manifest = fs::canonicalize(manifest)?;
@@ -360,9 +365,7 @@ fn read_numbers(path: &Path) -> io::Result<ModuleNumbers> {
 
 /// Replaces a file as a whole.
 fn write_whole(path: &Path, text: &str) -> io::Result<()> {
-    let new = path.with_extension("new");
-    let written = fs::write(&new, text).and_then(|()| fs::rename(&new, path));
-    written.map_err(|error| about(path, &error))
+    synced::replace(path, text.as_bytes()).map_err(|error| about(path, &error))
 }
 
 fn about(path: &Path, error: &dyn std::fmt::Display) -> io::Error {
@@ -425,6 +428,30 @@ mod tests {
             "{findings:?}"
         );
         fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_number_that_cannot_be_stored_starts_no_component_also_at_the_next_try() {
+        let state = std::env::temp_dir().join(format!("ua-state-{}", std::process::id()));
+        let mut all = Supervisor {
+            settings: Modules::try_parse_from(["modules", "/nowhere"]).unwrap(),
+            state: state.clone(),
+            numbers: ModuleNumbers::default(),
+            folder: ModuleFolder::default(),
+            running: JoinSet::new(),
+            stops: BTreeMap::new(),
+            findings: BTreeSet::new(),
+        };
+        for _ in 0..2 {
+            let error = all.start("a", Path::new("/nowhere/a.mtp")).unwrap_err();
+            assert!(error.to_string().contains("numbers.json"), "{error}");
+        }
+        fs::create_dir_all(&state).unwrap();
+        // The number is stored; only the manifest is missing now.
+        all.start("a", Path::new("/nowhere/a.mtp")).unwrap_err();
+        let mut stored = read_numbers(&state.join(NUMBERS)).unwrap();
+        assert_eq!(stored.of("a", (60, 16)), Some((60, false)));
+        fs::remove_dir_all(&state).unwrap();
     }
 
     #[test]

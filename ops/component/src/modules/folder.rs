@@ -154,6 +154,11 @@ impl ModuleNumbers {
         self.0.insert(name.to_owned(), free);
         Some((free, true))
     }
+
+    /// Forgets the number of a module that could not be stored.
+    pub(super) fn forget(&mut self, name: &str) {
+        self.0.remove(name);
+    }
 }
 
 const SHORTEST_PAUSE: Duration = Duration::from_secs(1);
