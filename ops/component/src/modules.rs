@@ -264,12 +264,7 @@ fn scan(
     findings: &mut BTreeSet<String>,
 ) -> io::Result<BTreeMap<String, ModuleFile>> {
     let mut found: BTreeMap<String, ModuleFile> = BTreeMap::new();
-    let mut paths: Vec<PathBuf> = fs::read_dir(folder)?
-        .take(MOST_ENTRIES)
-        .map(|entry| entry.map(|entry| entry.path()))
-        .collect::<Result<_, _>>()?;
-    paths.sort();
-    for path in paths {
+    for path in entries(folder, MOST_ENTRIES)? {
         let extension = path.extension().and_then(|one| one.to_str());
         let is_manifest = extension.is_some_and(|one| {
             let all = ["aml", "mtp", "amlx"];
@@ -305,6 +300,21 @@ fn scan(
         found.insert(name.to_owned(), file);
     }
     Ok(found)
+}
+
+/// Returns the sorted paths of all entries of a folder. A part of them would not do: a module
+/// whose manifest is left out would be stopped.
+fn entries(folder: &Path, most: usize) -> io::Result<Vec<PathBuf>> {
+    let mut paths: Vec<PathBuf> = fs::read_dir(folder)?
+        .take(most.saturating_add(1))
+        .map(|entry| entry.map(|entry| entry.path()))
+        .collect::<Result<_, _>>()?;
+    if paths.len() > most {
+        let fault = format!("it has more than {most} entries: move other files out of it");
+        return Err(about(folder, &fault));
+    }
+    paths.sort();
+    Ok(paths)
 }
 
 fn is_name(name: &str) -> bool {
@@ -427,6 +437,10 @@ mod tests {
             findings[1].contains("a.mtp: the module a is described by"),
             "{findings:?}"
         );
+        // A folder with too many entries is not read in part.
+        assert_eq!(entries(&folder, 6).unwrap().len(), 6);
+        let why = entries(&folder, 5).unwrap_err().to_string();
+        assert!(why.contains("more than 5 entries"), "{why}");
         fs::remove_dir_all(&folder).unwrap();
     }
 

@@ -33,6 +33,8 @@ pub(super) enum ComponentEnd {
 #[derive(Debug, Default)]
 pub(super) struct ModuleFolder {
     modules: BTreeMap<String, ModuleState>,
+    /// The manifests at the last look.
+    last: BTreeMap<String, ModuleFile>,
 }
 
 #[derive(Debug)]
@@ -56,12 +58,14 @@ enum ModuleState {
 }
 
 impl ModuleFolder {
-    /// Takes the manifests in the folder. A manifest counts when two looks find the same one.
+    /// Takes the manifests in the folder. A manifest, its change and its removal count when two
+    /// looks in a row find the same: editors replace a file in two steps.
     pub(super) fn look(
         &mut self,
         found: &BTreeMap<String, ModuleFile>,
         now: Duration,
     ) -> Vec<Change> {
+        let last = std::mem::replace(&mut self.last, found.clone());
         let mut changes = Vec::new();
         for (name, file) in found {
             if !self.modules.contains_key(name) {
@@ -87,7 +91,9 @@ impl ModuleFolder {
                     again: Some(again),
                     pause,
                 } if before == file && *again <= now => start(*pause),
-                ModuleState::Running { file: before, .. } if before != file => {
+                ModuleState::Running { file: before, .. }
+                    if before != file && last.get(name) == Some(file) =>
+                {
                     (ModuleState::Stopping, Change::Stop(name.clone()))
                 }
                 ModuleState::Ended { file: before, .. } | ModuleState::Settling(before)
@@ -109,6 +115,9 @@ impl ModuleFolder {
                 return true;
             }
             if matches!(state, ModuleState::Running { .. }) {
+                if last.contains_key(name) {
+                    return true;
+                }
                 *state = ModuleState::Stopping;
                 changes.push(Change::Stop(name.clone()));
             }
@@ -200,14 +209,33 @@ mod tests {
         assert_eq!(folder.look(&found(&[("a", 2)]), at(1)), [], "it grows");
         assert_eq!(folder.look(&found(&[("a", 2)]), at(2)), [start("a")]);
         assert_eq!(folder.look(&found(&[("a", 2)]), at(3)), []);
-        assert_eq!(folder.look(&found(&[]), at(4)), [stop("a")]);
-        assert_eq!(folder.look(&found(&[]), at(5)), [], "it is stopped once");
+        assert_eq!(folder.look(&found(&[]), at(4)), []);
+        assert_eq!(folder.look(&found(&[]), at(5)), [stop("a")]);
+        assert_eq!(folder.look(&found(&[]), at(6)), [], "it is stopped once");
         // It comes back while the component still ends: no second one starts beside it.
-        assert_eq!(folder.look(&found(&[("a", 2)]), at(6)), []);
         assert_eq!(folder.look(&found(&[("a", 2)]), at(7)), []);
-        folder.ended("a", ComponentEnd::Other, at(8));
-        assert_eq!(folder.look(&found(&[("a", 2)]), at(9)), []);
-        assert_eq!(folder.look(&found(&[("a", 2)]), at(10)), [start("a")]);
+        assert_eq!(folder.look(&found(&[("a", 2)]), at(8)), []);
+        folder.ended("a", ComponentEnd::Other, at(9));
+        assert_eq!(folder.look(&found(&[("a", 2)]), at(10)), []);
+        assert_eq!(folder.look(&found(&[("a", 2)]), at(11)), [start("a")]);
+    }
+
+    #[test]
+    fn a_component_goes_on_when_its_manifest_is_missing_or_different_at_one_look_only() {
+        let mut folder = ModuleFolder::default();
+        let files = found(&[("a", 1)]);
+        folder.look(&files, at(0));
+        assert_eq!(folder.look(&files, at(1)), [start("a")]);
+        let others = [found(&[]), found(&[("a", 0)]), found(&[("a", 2)])];
+        for (other, second) in others.iter().zip((2..).step_by(2)) {
+            assert_eq!(folder.look(other, at(second)), [], "{other:?}");
+            assert_eq!(folder.look(&files, at(second + 1)), [], "{other:?}");
+        }
+        // Two looks that find different changes do not agree either.
+        for other in others.iter().rev() {
+            assert_eq!(folder.look(other, at(10)), [], "{other:?}");
+        }
+        assert_eq!(folder.look(&found(&[]), at(11)), [stop("a")]);
     }
 
     #[test]
@@ -217,8 +245,8 @@ mod tests {
             folder.look(&found(&[("a", 1), ("b", 1)]), at(second));
         }
         let changed = found(&[("a", 2), ("b", 1)]);
-        assert_eq!(folder.look(&changed, at(2)), [stop("a")]);
-        assert_eq!(folder.look(&changed, at(3)), []);
+        assert_eq!(folder.look(&changed, at(2)), []);
+        assert_eq!(folder.look(&changed, at(3)), [stop("a")]);
         folder.ended("a", ComponentEnd::Other, at(4));
         assert_eq!(folder.look(&changed, at(5)), []);
         assert_eq!(folder.look(&changed, at(6)), [start("a")]);
