@@ -348,11 +348,14 @@ fn component_yaml(
 
 /// Returns the settings beside a manifest, if there are any.
 fn read_settings(path: &Path) -> io::Result<Option<String>> {
-    let file = match fs::File::open(path) {
-        Ok(file) => file,
+    // The opening of a pipe would wait for its writer, and all components would wait with it.
+    match fs::metadata(path) {
+        Ok(found) if found.is_file() => {}
+        Ok(_) => return Err(about(path, &"it is no regular file: remove it")),
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(about(path, &error)),
-    };
+    }
+    let file = fs::File::open(path).map_err(|error| about(path, &error))?;
     let mut text = String::new();
     let read = file.take(LARGEST_SETTINGS).read_to_string(&mut text);
     let length = read.map_err(|error| about(path, &error))?;
@@ -466,6 +469,19 @@ mod tests {
         let mut stored = read_numbers(&state.join(NUMBERS)).unwrap();
         assert_eq!(stored.of("a", (60, 16)), Some((60, false)));
         fs::remove_dir_all(&state).unwrap();
+    }
+
+    #[test]
+    fn settings_are_read_from_a_regular_file_only() {
+        let folder = std::env::temp_dir().join(format!("ua-settings-{}", std::process::id()));
+        fs::create_dir_all(folder.join("folder.yaml")).unwrap();
+        fs::write(folder.join("a.yaml"), "within: 3 s").unwrap();
+        let read = |name: &str| read_settings(&folder.join(name));
+        assert_eq!(read("a.yaml").unwrap().as_deref(), Some("within: 3 s"));
+        assert_eq!(read("b.yaml").unwrap(), None);
+        let why = read("folder.yaml").unwrap_err().to_string();
+        assert!(why.contains("folder.yaml: it is no regular file"), "{why}");
+        fs::remove_dir_all(&folder).unwrap();
     }
 
     #[test]
