@@ -540,20 +540,11 @@ impl Plant for Cell {
 
     fn attachment(&self, component: &str) -> Attachment {
         let present = self.present();
-        let endpoint = present.components.get(component).map(|of| &of.endpoint);
+        let endpoint = present.components.get(component).map(|of| &*of.endpoint);
         let states = present.components.values().flat_map(Component::tool_states);
-        for (_, state) in states {
-            let Some(current) = state.current.as_ref().filter(|tool| !tool.is_empty()) else {
-                continue;
-            };
-            if current == component {
-                return Attachment::AtRobot;
-            }
-            if state.mover == component || endpoint.is_some_and(|of| *of == state.mover) {
-                return Attachment::CarriesTool;
-            }
-        }
-        Attachment::None
+        let mut all = states.map(|(_, state)| state.attachment(component, endpoint));
+        let attached = all.find(|attachment| *attachment != Attachment::None);
+        attached.unwrap_or_default()
     }
 
     async fn read_tools(&self) {

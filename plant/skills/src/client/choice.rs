@@ -31,6 +31,29 @@ pub struct ToolState {
     pub mover: String,
 }
 
+impl ToolState {
+    /// Returns the ApplicationUri of the attached tool; `None` for none, and if it is unknown.
+    fn tool(&self) -> Option<&str> {
+        self.current.as_deref().filter(|tool| !tool.is_empty())
+    }
+
+    /// Returns what a component is attached to by this tool changer. The component is given by its
+    /// ApplicationUri, and by its endpoint if that is known.
+    pub fn attachment(&self, component: &str, endpoint: Option<&str>) -> Attachment {
+        let Some(tool) = self.tool() else {
+            return Attachment::None;
+        };
+        let is_at_mover = |endpoint: &str| is_same_endpoint(endpoint, &self.mover);
+        if tool == component {
+            Attachment::AtRobot
+        } else if self.mover == component || endpoint.is_some_and(is_at_mover) {
+            Attachment::CarriesTool
+        } else {
+            Attachment::None
+        }
+    }
+}
+
 /// A component that has the skills for a part of the work.
 #[derive(Debug, Clone, PartialEq)]
 struct SkilledComponent {
@@ -196,8 +219,7 @@ impl PeerAccess {
     /// Returns the robots that carry a tool at a tool changer.
     async fn movers_with_tools(&self, detector: &Detector) -> Vec<String> {
         let changers = self.changers(detector).await.into_iter();
-        let has_tool = |state: &ToolState| state.current.as_ref().is_some_and(|of| !of.is_empty());
-        let carrying = changers.filter(|(_, state)| has_tool(state));
+        let carrying = changers.filter(|(_, state)| state.tool().is_some());
         carrying.map(|(_, state)| state.mover).collect()
     }
 

@@ -8,6 +8,7 @@ use async_trait::async_trait;
 use tokio::sync::watch;
 
 use super::{ClientOptions, Detector, Needs, PeerAccess, Remote, SkillClient, ToolState};
+use crate::choosing::Attachment;
 use crate::component::{Component, Device, DriverFault, DriverSetup, Partner};
 use crate::conformance;
 use crate::driver::{Driver, Results, Work};
@@ -374,4 +375,25 @@ async fn the_robot_that_reaches_the_positions_is_chosen_with_a_reason_for_each_o
     for server in robots {
         server.stop().await;
     }
+}
+
+#[test]
+fn the_endpoint_of_a_robot_that_carries_a_tool_may_end_with_a_slash() {
+    let state = ToolState {
+        current: Some("urn:test:cup".to_owned()),
+        mover: "opc.tcp://robot:4840".to_owned(),
+        ..ToolState::default()
+    };
+    let of = |component, endpoint| state.attachment(component, Some(endpoint));
+    let (robot, cup) = ("urn:test:robot", "urn:test:cup");
+    assert_eq!(of(robot, "opc.tcp://robot:4840/"), Attachment::CarriesTool);
+    assert_eq!(of(robot, "opc.tcp://robot:4840"), Attachment::CarriesTool);
+    assert_eq!(of(robot, "opc.tcp://other:4840"), Attachment::None);
+    assert_eq!(of(cup, "opc.tcp://cup:4840"), Attachment::AtRobot);
+    let without = ToolState {
+        current: Some(String::new()),
+        ..state
+    };
+    let endpoint = Some("opc.tcp://robot:4840");
+    assert_eq!(without.attachment(robot, endpoint), Attachment::None);
 }
