@@ -3,9 +3,9 @@
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use plant_opcua::client::{Client, ClientError};
-use tokio::sync::Semaphore;
-use tokio::time::{Instant, timeout};
+use plant_opcua::client::{Client, ClientError, Link};
+use tokio::sync::{AcquireError, Semaphore, SemaphorePermit, watch};
+use tokio::time::{Instant, sleep};
 
 use crate::mirror::{self, Mirror};
 
@@ -15,6 +15,9 @@ use crate::mirror::{self, Mirror};
 #[derive(Debug)]
 pub(crate) struct Looks {
     slots: Semaphore,
+    /// Slots of the searches that have waited for `patience`.
+    late: Semaphore,
+    patience: Duration,
     servers: AtomicUsize,
 }
 
@@ -22,6 +25,8 @@ impl Default for Looks {
     fn default() -> Self {
         Self {
             slots: Semaphore::new(AT_ONCE),
+            late: Semaphore::new(LATE_AT_ONCE),
+            patience: MOST_WAIT,
             servers: AtomicUsize::new(0),
         }
     }
@@ -36,6 +41,20 @@ impl Looks {
             took: Duration::ZERO,
         }
     }
+
+    /// Waits until another search may run. Servers that do not respond must not keep the others
+    /// from being shown: after a while, more searches run.
+    async fn slot(&self) -> Result<SemaphorePermit<'_>, AcquireError> {
+        let late = async {
+            sleep(self.patience).await;
+            self.late.acquire().await
+        };
+        tokio::select! {
+            biased;
+            slot = self.slots.acquire() => slot,
+            slot = late => slot,
+        }
+    }
 }
 
 /// A server that is searched.
@@ -47,18 +66,31 @@ pub(crate) struct SearchedServer<'l> {
 }
 
 impl SearchedServer<'_> {
-    /// Reads the nodes of the server when few other searches are running.
+    /// Reads the nodes of the server when few other searches are running. Returns `None` when the
+    /// connection changes meanwhile.
     ///
     /// # Errors
     /// No response.
-    pub(crate) async fn look(&mut self, client: &Client) -> Result<Mirror, ClientError> {
-        // Servers that do not respond must not keep the others from being shown.
-        let slot = timeout(MOST_WAIT, self.looks.slots.acquire()).await;
-        let began = Instant::now();
-        let looked = mirror::look(client).await;
-        self.took = began.elapsed();
-        drop(slot);
-        looked
+    pub(crate) async fn look(
+        &mut self,
+        client: &Client,
+        link: &mut watch::Receiver<Link>,
+    ) -> Option<Result<Mirror, ClientError>> {
+        tokio::select! {
+            biased;
+            changed = link.changed() => {
+                drop(changed);
+                None
+            }
+            looked = async {
+                let slot = self.looks.slot().await;
+                let began = Instant::now();
+                let looked = mirror::look(client).await;
+                self.took = began.elapsed();
+                drop(slot);
+                looked
+            } => Some(looked),
+        }
     }
 
     /// Returns the time until the next search of a server without reported changes.
@@ -78,7 +110,9 @@ impl Drop for SearchedServer<'_> {
 
 /// Number of searches at the same time.
 const AT_ONCE: usize = 8;
-/// How long a search waits for the others at most.
+/// Number of searches at the same time beside these, of those that have waited long.
+const LATE_AT_ONCE: usize = 32;
+/// How long a search waits before it counts among the late ones.
 const MOST_WAIT: Duration = Duration::from_secs(5);
 /// Shortest pause between the searches of a server.
 const AGAIN: Duration = Duration::from_secs(2);
@@ -91,7 +125,26 @@ const AT_LAST: Duration = Duration::from_secs(120);
 
 #[cfg(test)]
 mod tests {
+    use tokio::time::timeout;
+
     use super::*;
+
+    #[tokio::test]
+    async fn searches_that_have_waited_long_are_few_at_the_same_time_too() {
+        let looks = Looks {
+            patience: Duration::ZERO,
+            ..Looks::default()
+        };
+        let mut slots = Vec::new();
+        for _ in 0..AT_ONCE + LATE_AT_ONCE {
+            slots.push(looks.slot().await.unwrap());
+        }
+        let more = timeout(Duration::from_millis(20), looks.slot()).await;
+        assert!(more.is_err(), "{more:?}");
+        drop(slots.pop());
+        let next = timeout(Duration::from_secs(10), looks.slot()).await;
+        assert!(next.is_ok(), "{next:?}");
+    }
 
     #[test]
     fn many_servers_are_searched_as_often_together_as_a_few() {

@@ -171,7 +171,10 @@ impl Tending {
             let run = of.client.started();
             // A server that executes a method may not respond to other requests.
             if known.is_none() || !of.client.is_calling() {
-                let looked = searched.look(of.client).await;
+                let Some(looked) = searched.look(of.client, link).await else {
+                    feeds.stop().await;
+                    return;
+                };
                 match looked.map(|looked| self.within_budget(of.url, looked)) {
                     Ok(looked) if known.as_ref() != Some(&looked) => {
                         self.show((of, run), &looked, copy.as_mut(), &mut feeds)
