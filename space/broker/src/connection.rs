@@ -376,12 +376,7 @@ impl<'a> Session<'a> {
     }
 
     fn publish(&mut self, message: QueuedMessage) {
-        let mut publication = message.0.clone();
-        if let Some(until) = message.1 {
-            // The broker stores it no longer than it has left here.
-            let now = TokioInstant::now().into_std();
-            publication.within = Some(until.saturating_duration_since(now));
-        }
+        let publication = with_time_left(&message);
         let id = match publication.confirmed {
             // All identifiers are used only if the broker confirms nothing.
             true => self.protocol.acquire_packet_id().ok(),
@@ -612,6 +607,17 @@ const fn key(kind: TimerKind) -> u8 {
 /// Returns the time for the queue.
 pub(crate) fn instant() -> Instant {
     TokioInstant::now().into_std()
+}
+
+/// Returns the publication of a message with the time that it has left: the broker stores it no
+/// longer.
+fn with_time_left((publication, until): &QueuedMessage) -> QueuedPublish {
+    let now = TokioInstant::now().into_std();
+    let left = until.map(|until| until.saturating_duration_since(now));
+    QueuedPublish {
+        within: left.or(publication.within),
+        ..publication.clone()
+    }
 }
 
 /// The time without an answer after which a broker is left, or `within` if it is longer.

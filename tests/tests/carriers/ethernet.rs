@@ -198,7 +198,8 @@ fn frames_that_the_receive_buffer_has_no_room_for_are_counted() {
             other.send(GROUP_MAC, &[UADP, &value(7, 1, 1000)]);
         }
         let mut buffer = vec![0; BUFFER];
-        let mut received = 0;
+        receiver.recv(&mut buffer).await.unwrap();
+        let mut received = 1;
         while let Some(message) = receiver.try_recv(&mut buffer) {
             message.unwrap();
             received += 1;
@@ -206,7 +207,7 @@ fn frames_that_the_receive_buffer_has_no_room_for_are_counted() {
         // The next frame says what was dropped before it.
         other.send(GROUP_MAC, &[UADP, &value(7, 2, 0)]);
         received += all_until(&mut receiver, 2).await.len() as u64 - 1;
-        assert!(received > 0 && received < SENT, "{received}");
+        assert!(received < SENT, "{received}");
         assert_eq!(receiver.dropped(), [("received_overflow", SENT - received)]);
     });
 }

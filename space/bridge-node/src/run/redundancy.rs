@@ -14,8 +14,8 @@ use crate::port::Port;
 use crate::redundancy::uncovered;
 
 impl<P: Port> Shell<P> {
-    /// Handles the datagrams that wait in the socket before a takeover: the heartbeats of the active
-    /// bridge may be among them. If they are too many, the takeover is deferred.
+    /// Handles the datagrams that wait in the socket before a takeover: the heartbeats of the
+    /// active bridge may be among them. If they are too many, the takeover is deferred.
     pub(super) fn read_waiting(&mut self, buffer: &mut Vec<u8>) {
         for _ in 0..READ_AT_ONCE {
             if !self.router.takes_over(now().monotonic) {
