@@ -467,7 +467,7 @@ fn the_cells_server_is_found_and_shows_who_is_there() {
     );
     assert_eq!(shown[1]["value"], true);
     gripper.signal(Signal::SIGKILL);
-    server.wait_for_line("a server is gone", SOON);
+    server.wait_for_line("lost a server", SOON);
     assert_eq!(read()[1]["value"], false);
     server.end();
     assert_eq!(registered(&uri), None, "it said so before it ended");
