@@ -198,7 +198,8 @@ fn frames_that_the_receive_buffer_has_no_room_for_are_counted() {
             other.send(GROUP_MAC, &[UADP, &value(7, 1, 1000)]);
         }
         let mut buffer = vec![0; BUFFER];
-        receiver.recv(&mut buffer).await.unwrap();
+        let first: &mut dyn Carrier = &mut receiver;
+        first.recv(&mut buffer).await.unwrap();
         let mut received = 1;
         while let Some(message) = receiver.try_recv(&mut buffer) {
             message.unwrap();
