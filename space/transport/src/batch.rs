@@ -22,7 +22,7 @@ pub(crate) const AT_ONCE: usize = 32;
 thread_local! {
     /// The headers of a receiving call. They refer to memory only during the call.
     static HEADERS: RefCell<MultiHeaders<SockaddrIn>> =
-        RefCell::new(MultiHeaders::preallocate(AT_ONCE, Some(cmsg_space!(TimeSpec, u32))));
+        RefCell::new(MultiHeaders::preallocate(AT_ONCE, Some(cmsg_space!(TimeSpec))));
 }
 
 /// The datagrams of a receiving call that were not yet taken.
@@ -31,9 +31,6 @@ pub(crate) struct Batch {
     received: [Received; AT_ONCE],
     count: usize,
     taken: usize,
-    /// The number of datagrams that the kernel dropped since the socket was made, as far as
-    /// received datagrams say it (`SO_RXQ_OVFL`).
-    overflow: u32,
 }
 
 impl fmt::Debug for Batch {
@@ -57,7 +54,6 @@ impl Default for Batch {
             received: [nothing; AT_ONCE],
             count: 0,
             taken: 0,
-            overflow: 0,
         }
     }
 }
@@ -74,7 +70,6 @@ impl Batch {
             buffer.resize(BUFFER, 0);
         }
         let (buffers, places) = (&mut self.buffers, &mut self.received);
-        let overflow = &mut self.overflow;
         let count = HEADERS.with_borrow_mut(|headers| {
             let mut slices = buffers.each_mut().map(|buffer| [IoSliceMut::new(buffer)]);
             let (slices, flags) = (slices.iter_mut(), MsgFlags::MSG_DONTWAIT);
@@ -83,12 +78,10 @@ impl Batch {
                 recvmmsg(socket, headers, slices, flags, None)?.zip(places.iter_mut())
             {
                 let from = message.address.map(SocketAddr::from);
-                let control = Control::of(&message);
-                *overflow = control.overflow.unwrap_or(*overflow);
                 *place = Received {
                     length: message.bytes,
                     from: from.unwrap_or(place.from),
-                    stamp: control.stamp,
+                    stamp: stamp(&message),
                 };
                 count += 1;
             }
@@ -123,43 +116,20 @@ impl Batch {
         Some((self.buffers.get_mut(next)?, *self.received.get(next)?))
     }
 
-    /// Drops the datagrams that were not yet taken. The next socket counts from 0.
+    /// Drops the datagrams that were not yet taken.
     pub(crate) const fn clear(&mut self) {
         self.taken = self.count;
-        self.overflow = 0;
-    }
-
-    /// Returns the number of datagrams that the kernel dropped since the socket was made, because
-    /// its receive buffer was full. The number wraps around.
-    pub(crate) const fn overflow(&self) -> u32 {
-        self.overflow
     }
 }
 
-/// The facts that the kernel adds to a datagram, if the socket asks for them.
-#[derive(Default)]
-struct Control {
-    /// The time at which the kernel received the datagram.
-    stamp: Option<SystemTime>,
-    /// The number of datagrams that the socket dropped before.
-    overflow: Option<u32>,
-}
-
-impl Control {
-    fn of(message: &RecvMsg<'_, '_, SockaddrIn>) -> Self {
-        let mut result = Self::default();
-        for control in message.cmsgs().into_iter().flatten() {
-            if let ControlMessageOwned::ScmTimestampns(stamp) = control {
-                result.stamp = time(stamp);
-            } else if let ControlMessageOwned::RxqOvfl(count) = control {
-                result.overflow = Some(count);
-            }
-        }
-        result
-    }
-}
-
-fn time(stamp: TimeSpec) -> Option<SystemTime> {
+/// Returns the time at which the kernel received a datagram, if the kernel stamps it.
+fn stamp(message: &RecvMsg<'_, '_, SockaddrIn>) -> Option<SystemTime> {
+    let stamp = message.cmsgs().ok()?.find_map(|control| {
+        let ControlMessageOwned::ScmTimestampns(stamp) = control else {
+            return None;
+        };
+        Some(stamp)
+    })?;
     let seconds = u64::try_from(stamp.tv_sec()).ok()?;
     let nanos = u32::try_from(stamp.tv_nsec()).ok()?;
     UNIX_EPOCH.checked_add(Duration::new(seconds, nanos))

@@ -10,7 +10,7 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::os::fd::AsRawFd as _;
 use std::task::{Context, Poll, ready};
 
-use nix::sys::socket::sockopt::{IpMtu, Priority, ReceiveTimestampns, RxqOvfl};
+use nix::sys::socket::sockopt::{IpMtu, Priority, ReceiveTimestampns};
 use nix::sys::socket::{bind, getsockopt, setsockopt};
 use socket2::{Domain, InterfaceIndexOrAddress, Protocol, Socket, Type};
 use tokio::io::Interest;
@@ -41,22 +41,6 @@ pub struct Ethernet {
     /// Received frames that were not yet taken.
     batch: Batch,
     faults: BTreeMap<FrameFault, u64>,
-    overflow: Overflow,
-}
-
-/// The frames that the kernel dropped, because the receive buffer was full.
-#[derive(Debug, Default)]
-struct Overflow {
-    total: u64,
-    /// The number of the present socket, which wraps around.
-    of_socket: u32,
-}
-
-impl Overflow {
-    fn note(&mut self, of_socket: u32) {
-        self.total += u64::from(of_socket.wrapping_sub(self.of_socket));
-        self.of_socket = of_socket;
-    }
 }
 
 /// Addresses and options of an [`Ethernet`].
@@ -161,7 +145,6 @@ impl Ethernet {
             lost: None,
             batch: Batch::default(),
             faults: BTreeMap::new(),
-            overflow: Overflow::default(),
         })
     }
 
@@ -188,7 +171,6 @@ impl Ethernet {
         self.sockets = Sockets::open(&self.options, &port)?;
         self.header = header(&self.options, &port);
         self.batch.clear();
-        self.overflow.of_socket = 0;
         let name = port.name.clone();
         self.port = port;
         Ok(Some(name))
@@ -244,7 +226,6 @@ impl Ethernet {
                 false => Err(io::ErrorKind::WouldBlock.into()),
             }
         });
-        self.overflow.note(self.batch.overflow());
         match filled {
             Ok(()) => Ok(true),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => Ok(false),
@@ -350,9 +331,9 @@ impl Carrier for Ethernet {
 
     fn dropped(&self) -> Vec<(&'static str, u64)> {
         let faults = self.faults.iter();
-        let faults = faults.map(|(fault, count)| (fault.reason(), *count));
-        let overflow = (self.overflow.total > 0).then_some((OVERFLOW, self.overflow.total));
-        faults.chain(overflow).collect()
+        faults
+            .map(|(fault, count)| (fault.reason(), *count))
+            .collect()
     }
 }
 
@@ -418,7 +399,14 @@ impl Sockets {
         socket
             .set_send_buffer_size(SEND_BUFFER)
             .map_err(at("set the send buffer"))?;
-        set_optional(&socket, options.tag);
+        if let Err(error) = setsockopt(&socket, ReceiveTimestampns, &true) {
+            debug!(%error, "the kernel does not stamp frames: delays end at this program");
+        }
+        if let Some(tag) = options.tag
+            && let Err(error) = setsockopt(&socket, Priority, &i32::from(tag.priority()))
+        {
+            debug!(%error, "the priority selects no queue of the interface");
+        }
         bind(socket.as_raw_fd(), &port.link)
             .map_err(io::Error::from)
             .map_err(at("bind"))?;
@@ -433,27 +421,6 @@ impl Sockets {
         let mtu = getsockopt(&self.member, IpMtu).ok();
         mtu.and_then(|mtu| usize::try_from(mtu).ok())
             .unwrap_or(USUAL_MTU)
-    }
-}
-
-/// Sets the options without which frames are received and sent all the same.
-fn set_optional(socket: &Socket, tag: Option<VlanTag>) {
-    let stamps = setsockopt(socket, ReceiveTimestampns, &true);
-    log_refusal(stamps, "delays end at this program");
-    let counts = setsockopt(socket, RxqOvfl, &1);
-    log_refusal(
-        counts,
-        "frames that do not fit the receive buffer are not counted",
-    );
-    if let Some(tag) = tag {
-        let queue = setsockopt(socket, Priority, &i32::from(tag.priority()));
-        log_refusal(queue, "the priority selects no queue of the interface");
-    }
-}
-
-fn log_refusal(set: nix::Result<()>, effect: &str) {
-    if let Err(error) = set {
-        debug!(%error, "the kernel refuses an option of the socket: {effect}");
     }
 }
 
@@ -510,8 +477,6 @@ fn member(options: &EthernetOptions, port: &EthernetPort) -> Result<Socket, Ethe
     Ok(socket)
 }
 
-/// The reason of a frame that the receive buffer had no room for.
-const OVERFLOW: &str = "received_overflow";
 /// The number of receiving calls after which faulty frames leave time for other work.
 const FILLS: usize = 4;
 const MOST_DRAINED: usize = 10_000;
@@ -523,17 +488,3 @@ const ANY_GROUP: Ipv4Addr = Ipv4Addr::new(239, 0, 0, 1);
 const DISCARD: u16 = 9;
 /// The error number of Linux for an address family that the program may not use.
 const EAFNOSUPPORT: i32 = 97;
-
-#[cfg(test)]
-mod tests {
-    use super::Overflow;
-
-    #[test]
-    fn frames_that_the_kernel_dropped_are_counted_once_and_beyond_a_wrapped_counter() {
-        let mut overflow = Overflow::default();
-        for of_socket in [0, 3, 3, u32::MAX, 1] {
-            overflow.note(of_socket);
-        }
-        assert_eq!(overflow.total, (1 << 32) + 1);
-    }
-}

@@ -181,39 +181,6 @@ fn padded_frames_are_received_and_frames_for_others_are_counted() {
 }
 
 #[test]
-fn frames_that_the_receive_buffer_has_no_room_for_are_counted() {
-    const SENT: u64 = 200;
-    let Some(_cell) = Cell::with(&[]) else {
-        return;
-    };
-    let _switch = Switch::new();
-    run(async {
-        let options = EthernetOptions {
-            receive_buffer: 8_192,
-            ..EthernetOptions::new("host1".to_owned(), GROUP_MAC)
-        };
-        let mut receiver = Ethernet::open(&options).unwrap();
-        let other = Raw::at("host2");
-        for _ in 0..SENT {
-            other.send(GROUP_MAC, &[UADP, &value(7, 1, 1000)]);
-        }
-        let mut buffer = vec![0; BUFFER];
-        let first: &mut dyn Carrier = &mut receiver;
-        first.recv(&mut buffer).await.unwrap();
-        let mut received = 1;
-        while let Some(message) = receiver.try_recv(&mut buffer) {
-            message.unwrap();
-            received += 1;
-        }
-        // The next frame says what was dropped before it.
-        other.send(GROUP_MAC, &[UADP, &value(7, 2, 0)]);
-        received += all_until(&mut receiver, 2).await.len() as u64 - 1;
-        assert!(received < SENT, "{received}");
-        assert_eq!(receiver.dropped(), [("received_overflow", SENT - received)]);
-    });
-}
-
-#[test]
 fn wireshark_reads_vlan_priority_and_values_of_frames() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
