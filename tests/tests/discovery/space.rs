@@ -88,8 +88,7 @@ fn the_whole_space_is_listed_without_configuration_and_tshark_reads_what_was_sai
             one(&all["servers"], "kind", &json!("cell server")).is_some(),
             // A component sends after it has looked for other writers of its namespace.
             all["spaces"][0]["calls"].as_u64() >= Some(5),
-        ];
-        let is_all = is_all == [true; 5];
+        ] == [true; 5];
         if !is_all {
             eprintln!("{all:#}");
         }
