@@ -3,7 +3,7 @@
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tracing::debug;
 
-/// Raises the limit to at most [`MOST`], as far as the system permits. The usual limit of a shell
+/// Raises the limit to at most 65 536, as far as the system permits. The usual limit of a shell
 /// is 1024, for programs that use `select`; a graph of 500 topics needs more.
 pub fn raise() {
     let limit = getrlimit(Resource::Nofile);
