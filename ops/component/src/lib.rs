@@ -25,6 +25,8 @@ mod reload;
 mod simulate;
 mod space;
 mod topics;
+#[cfg(feature = "devices")]
+mod verb;
 mod work;
 
 pub use mirrors::{Foreign, ForeignFaults, ForeignSkills};

@@ -11,7 +11,6 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitCode, Stdio};
 use std::time::Duration;
 
-use clap::Parser as _;
 use plant_opcua::synced;
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::process::{Child, Command};
@@ -21,6 +20,8 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use folder::{Change, ComponentEnd, ModuleFile, ModuleFolder, ModuleNumbers};
+
+use crate::verb;
 
 /// The argument that selects the folder.
 pub(crate) const VERB: &str = "modules";
@@ -55,25 +56,7 @@ struct Modules {
 
 /// Runs the components of a folder until SIGINT or SIGTERM.
 pub(crate) fn run(arguments: impl Iterator<Item = OsString>) -> ExitCode {
-    let modules = match Modules::try_parse_from(arguments) {
-        Ok(modules) => modules,
-        Err(error) => {
-            let code = if error.use_stderr() { USAGE } else { 0 };
-            // If printing fails, the exit code still reports the error.
-            error.print().ok();
-            return ExitCode::from(code);
-        }
-    };
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build();
-    match runtime.and_then(|runtime| runtime.block_on(Supervisor::run(modules))) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            crate::print(&format!("error: {error}\n"));
-            ExitCode::from(UNAVAILABLE)
-        }
-    }
+    verb::run(arguments, Supervisor::run)
 }
 
 /// The components of a folder.
@@ -393,11 +376,11 @@ const STOP_WITHIN: Duration = Duration::from_secs(30);
 const FAULTY: [i32; 3] = [64, 65, 78];
 const MOST_ENTRIES: usize = 10_000;
 const LARGEST_SETTINGS: u64 = 64 << 10;
-const USAGE: u8 = 64;
-const UNAVAILABLE: u8 = 69;
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser as _;
+
     use super::*;
 
     #[test]

@@ -5,13 +5,14 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use clap::Parser as _;
 use devices::{Faults, Line, Registers, Serving, kelvin, robotiq, schmalz, ur};
 use skills::simulated::Hole;
 use tokio::process::{Child, Command};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
+
+use crate::verb;
 
 /// The argument that selects the simulation.
 pub(crate) const VERB: &str = "simulate";
@@ -234,25 +235,7 @@ fn docked(text: &str) -> Result<kelvin::simulator::Docked, &'static str> {
 
 /// Simulates the device of the arguments. `arguments` begin with `simulate`.
 pub(crate) fn run(arguments: impl Iterator<Item = std::ffi::OsString>) -> ExitCode {
-    let simulate = match Simulate::try_parse_from(arguments) {
-        Ok(simulate) => simulate,
-        Err(error) => {
-            let code = if error.use_stderr() { USAGE } else { 0 };
-            // If printing fails, the exit code still reports the error.
-            error.print().ok();
-            return ExitCode::from(code);
-        }
-    };
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build();
-    match runtime.and_then(|runtime| runtime.block_on(simulated(simulate.device))) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            crate::print(&format!("error: {error}\n"));
-            ExitCode::from(UNAVAILABLE)
-        }
-    }
+    verb::run(arguments, |simulate: Simulate| simulated(simulate.device))
 }
 
 async fn simulated(device: Device) -> io::Result<()> {
@@ -353,10 +336,6 @@ fn told(line: &str) -> io::Result<()> {
     writeln!(out, "{line}")?;
     out.flush()
 }
-
-/// `EX_USAGE` and `EX_UNAVAILABLE` of `sysexits.h`.
-const USAGE: u8 = 64;
-const UNAVAILABLE: u8 = 69;
 
 #[cfg(test)]
 mod tests {
