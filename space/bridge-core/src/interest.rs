@@ -8,8 +8,8 @@ use mappings::SpaceId;
 /// drops all others by their headers, so a network may drop them earlier.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Interest {
-    /// The namespaces whose values, and whose probes for calls, it handles: those that it uses and
-    /// its own.
+    /// The namespaces that it uses, and its own. It handles their values, and their probes for
+    /// calls.
     pub namespaces: BTreeSet<(SpaceId, u16)>,
     /// The spaces whose announcements it handles.
     pub announced: BTreeSet<SpaceId>,
